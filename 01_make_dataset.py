@@ -1,0 +1,86 @@
+"""Stage 1: factors -> trajectories (App. A.1.1, Table 1, Fig 9).
+
+Draws factors (speed, direction, curvature), turns each draw into a trajectory of T transitions from the origin, and
+writes runs/dataset_<experiment>_seed<seed>.npz: trajectories (N, T + 1, 2), factors (N, M), names (M,).
+No robot is involved: the trajectories are what we want a robot to be able to do. Takes 3 s.
+"""
+import math
+
+import numpy as np
+
+import common
+from common import parse_flags, plt, save, save_figure, weak_labels
+
+EXPERIMENT = "main"     # row of EXPERIMENTS below
+SEED = 0                # random seed
+OUT = "."               # folder for runs/ and figures/
+
+TRAJECTORIES = 100_000  # N, App. A.1.1
+LENGTH = 5              # T, transitions per trajectory
+SPEED_LOW = 0.0         # speed ~ U(SPEED_LOW, SPEED_HIGH), trajectory units per transition (Table 1, 2D)
+SPEED_HIGH = 1.0        # no transition is longer than 1
+DIRECTION = 90.0        # direction ~ U(-DIRECTION, DIRECTION), degrees: the right-sided semicircle
+CURVATURE = 30.0        # curvature ~ U(-CURVATURE, CURVATURE), degrees turned per transition
+STRAIGHT = 0.2          # probability that the curvature is exactly 0
+
+EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
+    "main": {},
+}
+
+
+def make_trajectories(speed, direction, curvature, length):
+    """Factors (N,) each -> points (N, length + 1, 2): steps of `speed`, the heading turned by `curvature` at each one."""
+    heading = direction[:, None] + curvature[:, None] * np.arange(length)
+    steps = speed[:, None, None] * np.stack([np.cos(heading), np.sin(heading)], -1)
+    return np.concatenate([np.zeros((len(speed), 1, 2)), steps.cumsum(1)], 1)  # s_0 is fixed at the origin, Sec. 4.1
+
+
+def draw_fig09(trajectories, factors):
+    """Fig 9: the labelling criteria (left, middle) and trajectories of the data set by their curvature label (right)."""
+    figure, (rings, fan, data) = plt.subplots(1, 3, figsize=(10.5, 3.9))
+    for i, angle in enumerate(range(90, -90, -45)):
+        shades = plt.get_cmap("Blues")(np.linspace(0.15, 0.6, 4))
+        for j, radius in enumerate((0.25, 0.5, 0.75, 1.0)):
+            t = np.radians(np.linspace(angle, angle - 45, 30))
+            edge = [np.r_[r * f(t), (r - 0.25) * f(t[::-1])] for r, f in ((radius, np.cos), (radius, np.sin))]
+            rings.fill(*edge, color=shades[j], ec="white")
+            middle = np.radians(angle - 22.5)
+            rings.text((radius - 0.125) * np.cos(middle), (radius - 0.125) * np.sin(middle), f"{j + 1},{i + 1}",
+                       ha="center", va="center", fontsize=7)
+    rings.set(title="labels (speed, direction)", xlabel="x of a transition", ylabel="y of a transition", aspect="equal")
+    names = ("1: straight", "2: left", "3: right")
+    colours = (common.GREY, common.BLUE, common.RED)
+    for label, curvatures in enumerate(([0.0], [10, 20, 30], [-10, -20, -30])):
+        for k, degrees in enumerate(curvatures):
+            path = make_trajectories(np.ones(1), np.zeros(1), np.radians([degrees]), LENGTH)[0]
+            fan.plot(*path.T, "o-", ms=3, color=colours[label], label=names[label] if k == 0 else None)
+    fan.set(title="label curvature (10, 20, 30° per transition)", xlabel="x", ylabel="y", aspect="equal")
+    fan.legend(loc="center left")
+    labels = weak_labels(factors, ["curvature"])[:, 0]
+    for path, label in list(zip(trajectories, labels))[:300]:
+        data.plot(*path.T, color=colours[label], lw=0.6, alpha=0.7)
+    data.set(title="300 trajectories of the data set", xlabel="x (trajectory units)", ylabel="y (trajectory units)", aspect="equal")
+    save_figure(figure, OUT, "fig09_dataset" + ("" if EXPERIMENT == "main" else f"_{EXPERIMENT}"))
+
+
+if __name__ == "__main__":
+    config = parse_flags(globals())
+    rng = np.random.default_rng(SEED)
+    factors = {
+        "speed": rng.uniform(SPEED_LOW, SPEED_HIGH, TRAJECTORIES),
+        "direction": rng.uniform(-1, 1, TRAJECTORIES) * math.radians(DIRECTION),
+        "curvature": rng.uniform(-1, 1, TRAJECTORIES) * math.radians(CURVATURE) * (rng.random(TRAJECTORIES) >= STRAIGHT),
+    }
+    trajectories = make_trajectories(**factors, length=LENGTH)
+    path = save(OUT, "dataset", EXPERIMENT, SEED, config, trajectories=trajectories.astype(np.float32),
+                factors=np.stack(list(factors.values()), 1).astype(np.float32), names=np.array(list(factors)))
+
+    print(f"Table 1, as run: {TRAJECTORIES} trajectories of T = {LENGTH}")
+    print("factor      distribution            mean      min      max")
+    for name, text in [("speed", f"U({SPEED_LOW:g}, {SPEED_HIGH:g})"), ("direction", f"U(-{DIRECTION:g}, {DIRECTION:g}) deg"),
+                       ("curvature", f"U(-{CURVATURE:g}, {CURVATURE:g}) deg")]:
+        f = factors[name] if name == "speed" else np.degrees(factors[name])
+        print(f"{name:11s} {text:20s} {f.mean():8.3f} {f.min():8.3f} {f.max():8.3f}")
+    print(f"straight    {np.mean(factors['curvature'] == 0):.3f} of them (asked: {STRAIGHT:g})")
+    print(f"wrote {path}")
+    draw_fig09(trajectories, factors)

@@ -1,0 +1,387 @@
+"""What two or more of the four stages share, in the order a reader meets it:
+command line -> artifacts and CSV -> weak labels and factors -> decoder -> robot -> actor -> roll-outs -> plots.
+
+Units: trajectory units for decoder displacements (one transition at most 1), metres and radians in the world,
+STEP_SCALE metres per trajectory unit for a robot, 0.05 s per environment step.
+"""
+import argparse
+import ast
+import csv
+import ctypes.util
+import json
+import math
+import os
+import sys
+import zipfile
+from pathlib import Path
+
+if sys.platform == "linux" and "MUJOCO_GL" not in os.environ:  # off-screen rendering; must be set before mujoco loads, and
+    os.environ["MUJOCO_GL"] = "egl" if ctypes.util.find_library("EGL") else "disable"  # the default, GLFW, aborts without a screen
+
+import matplotlib
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch
+from torch import nn
+
+matplotlib.use("Agg")  # figures are files; no window is ever opened
+import matplotlib.pyplot as plt  # noqa: E402
+
+HERE = Path(__file__).parent
+FORMAT = 1  # artifact format; raise it when what is stored changes meaning
+SCRIPT = {"dataset": "01_make_dataset.py", "wetvae": "02_train_wetvae.py", "policy": "03_train_policy.py",
+          "checkpoint": "03_train_policy.py"}
+
+
+# ---------------------------------------------------------------- command line
+
+def stop(message, code=2):
+    """End with one line on stderr. Code 2: the input is wrong; 1: the run failed."""
+    print(f"{Path(sys.argv[0]).name}: {message}", file=sys.stderr)
+    raise SystemExit(code)
+
+
+def parse_flags(stage, argv=None):
+    """Make every `NAME = value  # comment` at the top of a stage a flag --name, and set the stage's globals from it.
+
+    stage: the script's globals(). A row of its EXPERIMENTS table overrides constants by name, flags override both.
+    Returns the configuration {NAME: value}. Exits with 2 and one line on an unknown flag, experiment or wrong type.
+    """
+    lines = Path(stage["__file__"]).read_text().splitlines()
+    comments = {}
+    for node in ast.parse("\n".join(lines)).body:
+        if isinstance(node, ast.Assign) and (name := getattr(node.targets[0], "id", "")).isupper():
+            if type(stage[name]) in (bool, int, float, str):
+                comments[name] = lines[node.end_lineno - 1].partition("  # ")[2]
+
+    def typed(kind):
+        def parse(text):
+            if kind is bool and text.lower() not in ("true", "false"):
+                raise ValueError
+            value = text.lower() == "true" if kind is bool else kind(text)
+            if kind in (int, float) and not 0 <= value < math.inf:
+                raise ValueError
+            return value
+        parse.__name__ = {bool: "true or false", int: "whole number, 0 or more", float: "number, 0 or more"}.get(kind, "text")
+        return parse
+
+    parser = argparse.ArgumentParser(description=stage["__doc__"], allow_abbrev=False,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.error = lambda message: stop(f"{message}; see --help")
+    for name, comment in comments.items():
+        parser.add_argument("--" + name.lower(), dest=name, type=typed(type(stage[name])), metavar=type(stage[name]).__name__,
+                            help=f"{comment} [{stage[name]}]".replace("%", "%%"))
+    given, unknown = parser.parse_known_args(argv)
+    if unknown:
+        stop(f"unknown flag {unknown[0]}; allowed: {' '.join('--' + n.lower() for n in comments)}")
+    flags = {name: value for name, value in vars(given).items() if value is not None}
+    experiment = flags.get("EXPERIMENT", stage["EXPERIMENT"])
+    if experiment not in stage["EXPERIMENTS"]:
+        stop(f"unknown experiment {experiment!r}; allowed: {' '.join(stage['EXPERIMENTS'])}")
+    stage.update(stage["EXPERIMENTS"][experiment])
+    stage.update(flags)
+    return {name: stage[name] for name in comments} | stage["EXPERIMENTS"][experiment]
+
+
+# ---------------------------------------------------------------- artifacts and CSV
+
+def artifact_name(kind, experiment, seed):
+    return f"{kind}_{experiment}_seed{seed}" + (".npz" if kind == "dataset" else ".pt")
+
+
+def save(out, kind, experiment, seed, config, **content):
+    """Write runs/<kind>_<experiment>_seed<seed>, whole or not at all. content: arrays (.npz) or tensors and plain values (.pt)."""
+    path = Path(out) / "runs" / artifact_name(kind, experiment, seed)
+    meta = dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed, config=config,
+                versions=dict(torch=str(torch.__version__), mujoco=mujoco.__version__, numpy=np.__version__))
+    partial = path.with_name(path.name + ".partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(partial, "wb") as file:
+            if kind == "dataset":
+                np.savez(file, meta=json.dumps(meta), **content)
+            else:
+                torch.save(meta | content, file)
+        os.replace(partial, path)  # atomic: a reader sees the old artifact or the new one, never half of one
+    except OSError as error:
+        partial.unlink(missing_ok=True) if os.access(path.parent, os.W_OK) else None
+        stop(f"cannot write {path}: {error.strerror}; free the space or choose another place with --out", code=1)
+    return path
+
+
+def load(out, kind, experiment, seed, quiet=False):
+    """Read an artifact from runs/, else pretrained/, and say which was taken. Exits with 2 and one line if it is not sound."""
+    name = artifact_name(kind, experiment, seed)
+    make = f"make it with: python {SCRIPT[kind]} --experiment {experiment} --seed {seed}"
+    path = next((p for p in (Path(out) / "runs" / name, HERE / "pretrained" / name) if p.exists()), None)
+    if path is None:
+        stop(f"no {name} in runs/ or pretrained/; {make}")
+    try:
+        if kind == "dataset":
+            with np.load(path, allow_pickle=False) as file:
+                content = {key: file[key] for key in file.files}
+            content |= json.loads(str(content.pop("meta")))
+        else:
+            with zipfile.ZipFile(path) as file:  # torch does not check the archive's checksums, zipfile does
+                if file.testzip():
+                    raise ValueError
+            content = torch.load(path, weights_only=True)
+    except Exception:  # numpy, zipfile and torch raise a dozen kinds on a damaged file; every one means the same to a reader
+        stop(f"{path} is not readable (truncated, damaged or not an artifact of this project); {make}")
+    for key, wanted in dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed).items():
+        if (found := content.get(key)) != wanted:
+            stop(f"{path} has {key} {found!r} where {wanted!r} is needed; {make}")
+    if not quiet:
+        print(f"using {path.relative_to(HERE) if path.is_relative_to(HERE) else path}")
+    return content
+
+
+def update_csv(path, rows, key):
+    """Write rows (dicts), replacing those in the file that agree with one of them on the columns in key."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    old = read_csv(path) if path.exists() else []
+    new = [{k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in row.items()} for row in rows]
+    ours = {tuple(row[k] for k in key) for row in new}
+    partial = path.with_name(path.name + ".partial")
+    with open(partial, "w", newline="") as file:
+        writer = csv.DictWriter(file, list(new[0]), extrasaction="ignore", restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows([row for row in old if tuple(row[k] for k in key) not in ours] + new)
+    os.replace(partial, path)
+
+
+def read_csv(path):
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+# ---------------------------------------------------------------- weak labels and factors
+
+LABEL_RULES = {  # factor: (number of classes, class from the factors, counted from 0), App. A.1.1
+    "speed": (4, lambda f: np.floor(f["speed"] / 0.25)),
+    "direction": (4, lambda f: np.floor((math.pi / 2 - f["direction"]) / (math.pi / 4))),  # from +90 degrees downwards
+    "curvature": (3, lambda f: np.select([f["curvature"] > 0, f["curvature"] < 0], [1, 2], 0)),  # straight, left, right
+}
+FULL_RANGE = {"speed": 1.0, "direction": math.pi, "curvature": math.pi / 3}  # of Table 1, for the cross-talk matrix
+
+
+def weak_labels(factors, names):
+    """factors: dict name -> (N,). Returns (N, M) int64 classes counted from 0 (the paper counts from 1)."""
+    rules = [LABEL_RULES[name] for name in names]
+    return np.stack([np.clip(rule(factors), 0, classes - 1).astype(np.int64) for classes, rule in rules], axis=1)
+
+
+def factors_of(displacement):
+    """Factors of trajectories given by their transitions. displacement (N, T, 2) -> dict of (N,): speed in the unit of
+    the displacement, direction of the first transition in radians, curvature in radians per transition."""
+    heading = np.arctan2(displacement[..., 1], displacement[..., 0])
+    turn = (np.diff(heading, axis=1) + math.pi) % (2 * math.pi) - math.pi
+    return dict(speed=np.linalg.norm(displacement, axis=-1).mean(1), direction=heading[:, 0],
+                curvature=turn.mean(1) if turn.shape[1] else np.zeros(len(turn)))
+
+
+def cross_talk(curves, names):
+    """C[i, j] = range of factor j while axis i is traversed / full range of factor j; purity_i = C[i, i] / sum_j C[i, j].
+
+    curves: one dict of factors per axis, in the order of names. Returns C (M, M), purity (M,). No encoder is involved."""
+    C = np.array([[np.ptp(curve[name]) / FULL_RANGE[name] for name in names] for curve in curves])
+    return C, np.diag(C) / C.sum(1)
+
+
+# ---------------------------------------------------------------- the decoder: predictive model and reward
+
+class Decoder(nn.Module):
+    """p_theta(tau | z), Fig 1: an LSTM that reads z and its own last mean and gives a Gaussian over the next displacement.
+
+    The trap: with the true last displacement as input, noise-free trajectories give their factors away after two steps,
+    z is not needed and stays entangled. So the decoder never sees the truth, in training either.
+    """
+
+    def __init__(self, z_dim, x_dim=2, hidden=64):
+        super().__init__()
+        self.cell = nn.LSTMCell(x_dim + z_dim, hidden)
+        self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2 * x_dim))
+        self.register_buffer("axes", torch.eye(z_dim))  # canonical z -> latent of training: a signed permutation
+
+    def forward(self, z, steps):
+        """z (B, M) -> mean and log-variance of the displacements, (B, steps, x_dim) each, in trajectory units."""
+        z, state, outputs = z @ self.axes, None, []
+        mean = z.new_zeros(len(z), self.cell.input_size - z.shape[1])
+        for _ in range(steps):
+            state = self.cell(torch.cat([mean, z], 1), state)
+            mean, log_var = self.head(state[0]).chunk(2, 1)
+            outputs.append(torch.stack([mean, log_var]))
+        return torch.stack(outputs, 2).unbind(0)
+
+
+def load_decoder(content):
+    decoder = Decoder(content["decoder"]["axes"].shape[0])
+    decoder.load_state_dict(content["decoder"])
+    return decoder.requires_grad_(False)
+
+
+def gaussian_log_prob(x, mean, log_var):
+    """log N(x; mean, exp(log_var)), elementwise."""
+    return -0.5 * ((x - mean) ** 2 * torch.exp(-log_var) + log_var + math.log(2 * math.pi))
+
+
+def next_skill(z, weight):
+    """The relation functions of the Ant, Sec. 6.1.2: f_speed is the identity, f_dir(z_dir, z_cur) = z_dir + weight z_cur.
+    z (..., 3) = (speed, direction, curvature). The paper tunes the weight by hand; 03 calibrates it from the decoder."""
+    return torch.stack([z[..., 0], z[..., 1] + weight * z[..., 2], z[..., 2]], -1)
+
+
+@torch.no_grad()
+def predict(decoder, z, steps, weight=None):
+    """Displacements (B, T, 2), in trajectory units, that skills z (B, 3) promise: the decoder's means.
+
+    weight None: `steps` free steps of the decoder, as in the paper. Else its first step, `steps` times, with z moved by
+    the relation function in between: exactly what the policy will be told to do."""
+    if weight is None:
+        return decoder(z, steps)[0]
+    skills = [z]
+    for _ in range(steps - 1):
+        skills.append(next_skill(skills[-1], weight))
+    z = torch.stack(skills, 1)
+    z[..., 2:] = 0  # z_multi = 0: a single step is conditioned on z_single
+    return decoder(z.flatten(0, 1), 1)[0].view(len(z), steps, -1)
+
+
+# ---------------------------------------------------------------- the robot
+
+FRAME_SKIP = 5       # physics steps of 0.01 s per environment step
+STEP_SCALE = 0.1     # metres per trajectory unit and environment step, Ant (App. A.1.3: mean / 10)
+REST = (0, 0, 0.55, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1)  # the pose the Ant's model file calls init_qpos
+
+
+def ant_spec():
+    """The Ant of the MuJoCo benchmarks (8 hinges, 13 bodies), built in code. nq 15, nv 14, nu 8, RK4 at 0.01 s."""
+    spec = mujoco.MjSpec()
+    spec.modelname, spec.compiler.degree = "ant", True
+    spec.option.integrator, spec.option.timestep = mujoco.mjtIntegrator.mjINT_RK4, 0.01
+    joint, geom = spec.default.joint, spec.default.geom
+    joint.armature, joint.damping, joint.limited = 1, [1, 0, 0], True
+    geom.density, geom.friction, geom.margin, geom.rgba = 5, [1, 0.5, 0.5], 0.01, [0.8, 0.6, 0.4, 1]
+    geom.condim, geom.conaffinity = 3, 0  # contype 1 against conaffinity 0: legs do not collide with one another
+    capsule = dict(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.08, 0, 0])
+
+    world = spec.worldbody
+    world.add_light(pos=[0, 0, 1.3], dir=[0, 0, -1.3], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, diffuse=[1, 1, 1])
+    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[40, 40, 40], conaffinity=1, rgba=[0.8, 0.9, 0.8, 1])
+    torso = world.add_body(name="torso", pos=[0, 0, 0.75])
+    torso.add_freejoint(name="root")
+    torso.add_geom(name="torso_geom", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.25, 0, 0])
+    legs = [("1", 1, 1, [-1, 1, 0], [30, 70]), ("2", -1, 1, [1, 1, 0], [-70, -30]),
+            ("3", -1, -1, [-1, 1, 0], [-70, -30]), ("4", 1, -1, [1, 1, 0], [30, 70])]
+    for name, x, y, axis, bend in legs:
+        leg = torso.add_body(name="leg_" + name)
+        leg.add_geom(name="aux_" + name, fromto=[0, 0, 0, 0.2 * x, 0.2 * y, 0], **capsule)
+        thigh = leg.add_body(name="thigh_" + name, pos=[0.2 * x, 0.2 * y, 0])
+        thigh.add_joint(name="hip_" + name, axis=[0, 0, 1], range=[-30, 30])
+        thigh.add_geom(name="thigh_" + name, fromto=[0, 0, 0, 0.2 * x, 0.2 * y, 0], **capsule)
+        shin = thigh.add_body(name="shin_" + name, pos=[0.2 * x, 0.2 * y, 0])
+        shin.add_joint(name="ankle_" + name, axis=axis, range=bend)
+        shin.add_geom(name="shin_" + name, fromto=[0, 0, 0, 0.4 * x, 0.4 * y, 0], **capsule)
+    for name in "4123":  # the order of the benchmark's actuators
+        for part in ("hip_", "ankle_"):
+            motor = spec.add_actuator(name=part + name, target=part + name, trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                                      ctrllimited=True, ctrlrange=[-1, 1])
+            motor.set_to_motor()
+            motor.gear[0] = 150
+    return spec
+
+
+class Robots:
+    """n robots of one model that step together on threads; equal to a loop over mj_step (mujoco.batch)."""
+
+    def __init__(self, spec, n, threads=2):
+        self.batch = Batch(spec.compile(), n, threads)
+        self.qpos, self.qvel, self.ctrl, self.time = map(self.batch.bind, ("qpos", "qvel", "ctrl", "time"))  # live views
+        self.reset(np.arange(n))
+
+    def reset(self, ids, rng=None, noise=0.1):
+        """Put robots ids at the origin in the rest pose; with rng add U(-noise, noise) to positions, N(0, noise) to velocities."""
+        self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)  # also clears the solver's warm start
+        self.qpos[ids] = REST
+        if rng is not None:
+            self.qpos[ids] += rng.uniform(-noise, noise, (len(ids), self.qpos.shape[1]))
+            self.qvel[ids] = rng.normal(0, noise, (len(ids), self.qvel.shape[1]))
+
+    def observe(self):
+        """The policy's state (n, 27): qpos without x and y, qvel. Float32."""
+        return torch.from_numpy(np.concatenate([self.qpos[:, 2:], self.qvel], 1, dtype=np.float32, casting="same_kind"))
+
+    def step(self, action):
+        """One environment step of 0.05 s. action (n, 8) in [-1, 1]. Returns displacement (n, 2) in metres and which
+        simulations MuJoCo found unstable (n,): it has reset those, so that their displacement means nothing."""
+        before, clock = self.qpos[:, :2].copy(), self.time.copy()
+        self.ctrl[:] = action
+        self.batch.step(nstep=FRAME_SKIP)
+        unstable = (self.time <= clock).reshape(-1) | ~np.isfinite(self.qpos).all(1)  # an automatic reset sets the clock back
+        return torch.from_numpy((self.qpos[:, :2] - before).astype(np.float32)), unstable
+
+
+# ---------------------------------------------------------------- the skill policy
+
+class Actor(nn.Module):
+    """pi_psi(a | s, z_single): a Gaussian squashed by tanh, Sec. 4.2.2. Normalises the state by fixed statistics."""
+
+    def __init__(self, s_dim, z_dim, a_dim, hidden):
+        super().__init__()
+        self.net = nn.Sequential(nn.Linear(s_dim + z_dim, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
+                                 nn.Linear(hidden, 2 * a_dim))
+        self.register_buffer("s_mean", torch.zeros(s_dim))
+        self.register_buffer("s_std", torch.ones(s_dim))
+
+    def inputs(self, s, z):
+        return torch.cat([((s - self.s_mean) / self.s_std).clamp(-10, 10), z], -1)
+
+    def forward(self, x, deterministic=False):
+        """x = inputs(s, z) (B, s_dim + z_dim) -> action (B, a_dim) in (-1, 1), log-probability (B,)."""
+        mean, log_std = self.net(x).chunk(2, -1)
+        log_std = log_std.clamp(-5, 2)
+        noise = torch.zeros_like(mean) if deterministic else torch.randn_like(mean)
+        u = mean + log_std.exp() * noise
+        # log pi(a) = log N(u) - sum log(1 - tanh(u)^2), the last in a form that does not overflow for large |u|
+        log_prob = -0.5 * noise ** 2 - log_std - 0.5 * math.log(2 * math.pi)
+        log_prob = log_prob - 2 * (math.log(2) - u - nn.functional.softplus(-2 * u))
+        return torch.tanh(u), log_prob.sum(-1)
+
+
+def load_actor(content):
+    state = content["actor"]
+    a_dim, hidden, s_dim = len(state["net.4.bias"]) // 2, len(state["net.0.bias"]), len(state["s_mean"])
+    actor = Actor(s_dim, state["net.0.weight"].shape[1] - s_dim, a_dim, hidden)
+    actor.load_state_dict(state)
+    return actor.requires_grad_(False)
+
+
+@torch.no_grad()
+def execute(actor, robots, z, steps, hold, weight, deterministic):
+    """Alg. 2, execution: hold z_single for `hold` (H_z) environment steps, move it by the relation function, `steps` (T) times.
+    z (n, 3). Yields after each environment step (for contacts, frames and stopping); the robots hold the state."""
+    for _ in range(steps):
+        for _ in range(hold):
+            action, _ = actor(actor.inputs(robots.observe(), z[:, :2]), deterministic)
+            yield robots.step(action.numpy())
+        z = next_skill(z, weight)
+
+
+# ---------------------------------------------------------------- plots
+
+# The paper's red, green, blue, cyan, yellow for latents (-1, -0.5, 0, 0.5, 1), in colour-blind safe hues (Okabe-Ito).
+LATENT_COLOURS = dict(zip((-1, -0.5, 0, 0.5, 1), ("#D55E00", "#009E73", "#0072B2", "#56B4E9", "#F0E442")))
+BLUE, RED, GREY = "#0072B2", "#D55E00", "#888888"
+TRAVERSAL_MAP = "viridis"  # for many values of one latent
+plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
+                     "grid.alpha": 0.25, "figure.dpi": 110, "savefig.bbox": "tight", "legend.frameon": False,
+                     "axes.titlesize": 10, "figure.constrained_layout.use": True})
+
+
+def save_figure(figure, out, name):
+    path = Path(out) / "figures" / f"{name}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+    plt.close(figure)
+    print(f"wrote figures/{path.name}")
