@@ -25,6 +25,7 @@ OUT = "."              # folder for runs/, figures/ and results/
 TRAIN = True           # false: only draw and measure what is already trained
 
 DATA = "main"          # experiment of 01 to train on
+DATA_SEED = 0          # and its seed
 LABELS = "speed direction curvature"  # factors with a weak label y^m
 BASELINE = True        # also train the trajectory VAE, the same model without labels
 
@@ -190,7 +191,7 @@ if __name__ == "__main__":
     if unknown := set(LABELS.split()) - set(LABEL_RULES):
         stop(f"no weak label {sorted(unknown)[0]!r}; allowed: {' '.join(LABEL_RULES)}")
     torch.set_num_threads(THREADS)
-    dataset = load(OUT, "dataset", DATA, 0)
+    dataset = load(OUT, "dataset", DATA, DATA_SEED)
     names = [str(name) for name in dataset["names"]]
     factors = dataset["factors"]
     x = torch.from_numpy(np.diff(dataset["trajectories"], axis=1))  # displacements: the model is position-agnostic

@@ -27,6 +27,7 @@ MINUTES = 0.0            # if not 0, the schedules run out with this clock inste
 CHECKPOINT = 5.0         # minutes between checkpoints
 
 DECODER = "main"         # experiment of 02 whose decoder is the reward
+DECODER_SEED = 0         # and its seed
 METHOD = "wedis"         # named in results/
 ROBOT = "ant"            # named in results/
 
@@ -220,6 +221,9 @@ def train(decoder, config):
 
     if RESUME:
         state = load(OUT, "checkpoint", EXPERIMENT, SEED)
+        for name in set(config) - {"RESUME", "OUT", "THREADS", "CHECKPOINT", "UPDATES", "MINUTES"}:
+            if state["config"].get(name) != config[name]:
+                stop(f"the checkpoint was made with --{name.lower()} {state['config'].get(name)}, not {config[name]}; resume with the same")
         networks.load_state_dict(state["networks"])
         target.load_state_dict(state["target"])
         optimizer.load_state_dict(state["optimizer"])
@@ -313,11 +317,16 @@ def train(decoder, config):
 if __name__ == "__main__":
     config = parse_flags(globals())
     torch.set_num_threads(THREADS)
-    decoder_content = load(OUT, "wetvae", DECODER, 0)
+    decoder_content = load(OUT, "wetvae", DECODER, DECODER_SEED)
     decoder = load_decoder(decoder_content)
     weight, mismatch = calibrate_relation(decoder)
     if TRAIN:
-        trained = train(decoder, config)
+        if not BATCH <= WARM_UP <= REPLAY:
+            stop(f"--warm_up {WARM_UP} must lie between --batch {BATCH} and --replay {REPLAY}")
+        try:
+            trained = train(decoder, config)
+        except KeyboardInterrupt:
+            stop("stopped by hand; go on from the last checkpoint with --resume true", code=1)
         save(OUT, "policy", EXPERIMENT, SEED, config, decoder=decoder_content["decoder"], relation_weight=weight, **trained)
     policy = load(OUT, "policy", EXPERIMENT, SEED)
     actor = load_actor(policy)

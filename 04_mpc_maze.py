@@ -8,7 +8,7 @@ from pathlib import Path
 
 import common  # before mujoco: it chooses how mujoco renders
 from common import (STEP_SCALE, Robots, ant_spec, execute, load, load_actor, load_decoder, parse_flags, plt, predict, save_figure,
-                    stop, update_csv)
+                    stop, update_csv, write_whole)
 import mujoco
 import numpy as np
 import torch
@@ -217,7 +217,8 @@ def animate(maze, poses, every=6):
         frames.append(Image.fromarray(np.concatenate(views, 1)))
     path = Path(OUT) / "figures" / f"{maze}.gif"
     frames = [frame.quantize(64, dither=Image.Dither.NONE) for frame in frames]
-    frames[0].save(path, save_all=True, append_images=frames[1:] + [frames[-1]] * 10, duration=60, loop=0, optimize=True)
+    write_whole(path, lambda file: frames[0].save(file, "GIF", save_all=True, append_images=frames[1:] + [frames[-1]] * 10,
+                                                  duration=60, loop=0, optimize=True))
     print(f"wrote figures/{path.name}, {how}")
 
 
@@ -246,6 +247,8 @@ if __name__ == "__main__":
     torch.set_num_threads(THREADS)
     policy = load(OUT, "policy", POLICY, POLICY_SEED)
     actor, decoder, weight = load_actor(policy), load_decoder(policy), policy["relation_weight"]
+    if len(actor.s_mean) != 27 or len(decoder.axes) != 3:
+        stop(f"policy {POLICY} is not an Ant with speed, direction and curvature; choose --policy ant_semi")
 
     start, table, examples, films = time.time(), [], [], {}
     for maze in MAZES.split():

@@ -6,8 +6,10 @@ STEP_SCALE metres per trajectory unit for a robot, 0.05 s per environment step.
 """
 import argparse
 import ast
+import contextlib
 import csv
 import ctypes.util
+import io
 import json
 import math
 import os
@@ -81,7 +83,7 @@ def parse_flags(stage, argv=None):
         stop(f"unknown experiment {experiment!r}; allowed: {' '.join(stage['EXPERIMENTS'])}")
     stage.update(stage["EXPERIMENTS"][experiment])
     stage.update(flags)
-    return {name: stage[name] for name in comments} | stage["EXPERIMENTS"][experiment]
+    return stage["EXPERIMENTS"][experiment] | {name: stage[name] for name in comments}
 
 
 # ---------------------------------------------------------------- artifacts and CSV
@@ -90,23 +92,27 @@ def artifact_name(kind, experiment, seed):
     return f"{kind}_{experiment}_seed{seed}" + (".npz" if kind == "dataset" else ".pt")
 
 
+def write_whole(path, write):
+    """write(file) to path, whole or not at all: a reader sees the old file or the new one, never half of one."""
+    partial = path.with_name(path.name + ".partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(partial, "wb") as file:
+            write(file)
+        os.replace(partial, path)  # atomic
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        stop(f"cannot write {path}: {error.strerror}; free the space or choose another place with --out", code=1)
+
+
 def save(out, kind, experiment, seed, config, **content):
     """Write runs/<kind>_<experiment>_seed<seed>, whole or not at all. content: arrays (.npz) or tensors and plain values (.pt)."""
     path = Path(out) / "runs" / artifact_name(kind, experiment, seed)
     meta = dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed, config=config,
                 versions=dict(torch=str(torch.__version__), mujoco=mujoco.__version__, numpy=np.__version__))
-    partial = path.with_name(path.name + ".partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(partial, "wb") as file:
-            if kind == "dataset":
-                np.savez(file, meta=json.dumps(meta), **content)
-            else:
-                torch.save(meta | content, file)
-        os.replace(partial, path)  # atomic: a reader sees the old artifact or the new one, never half of one
-    except OSError as error:
-        partial.unlink(missing_ok=True) if os.access(path.parent, os.W_OK) else None
-        stop(f"cannot write {path}: {error.strerror}; free the space or choose another place with --out", code=1)
+    write_whole(path, lambda file: np.savez(file, meta=json.dumps(meta), **content) if kind == "dataset"
+                else torch.save(meta | content, file))
     return path
 
 
@@ -139,16 +145,14 @@ def load(out, kind, experiment, seed, quiet=False):
 
 def update_csv(path, rows, key):
     """Write rows (dicts), replacing those in the file that agree with one of them on the columns in key."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     old = read_csv(path) if path.exists() else []
     new = [{k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in row.items()} for row in rows]
     ours = {tuple(row[k] for k in key) for row in new}
-    partial = path.with_name(path.name + ".partial")
-    with open(partial, "w", newline="") as file:
-        writer = csv.DictWriter(file, list(new[0]), extrasaction="ignore", restval="", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows([row for row in old if tuple(row[k] for k in key) not in ours] + new)
-    os.replace(partial, path)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(new[0]), extrasaction="ignore", restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows([row for row in old if tuple(row.get(k) for k in key) not in ours] + new)
+    write_whole(path, lambda file: file.write(text.getvalue().encode()))
 
 
 def read_csv(path):
@@ -270,7 +274,7 @@ def ant_spec():
     world.add_light(pos=[0, 0, 1.3], dir=[0, 0, -1.3], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, diffuse=[1, 1, 1])
     world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[40, 40, 40], conaffinity=1, rgba=[0.8, 0.9, 0.8, 1])
     torso = world.add_body(name="torso", pos=[0, 0, 0.75])
-    torso.add_freejoint(name="root")
+    torso.add_freejoint(name="root").margin = 0.01
     torso.add_geom(name="torso_geom", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.25, 0, 0])
     legs = [("1", 1, 1, [-1, 1, 0], [30, 70]), ("2", -1, 1, [1, 1, 0], [-70, -30]),
             ("3", -1, -1, [-1, 1, 0], [-70, -30]), ("4", 1, -1, [1, 1, 0], [30, 70])]
@@ -303,7 +307,7 @@ class Robots:
     def reset(self, ids, rng=None, noise=0.1):
         """Put robots ids at the origin in the rest pose; with rng add U(-noise, noise) to positions, N(0, noise) to velocities."""
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)  # also clears the solver's warm start
-        self.qpos[ids] = REST
+        self.qpos[ids], self.time[ids] = REST, 1.0  # clocks start at 1 s, MuJoCo's own reset of an unstable simulation at 0
         if rng is not None:
             self.qpos[ids] += rng.uniform(-noise, noise, (len(ids), self.qpos.shape[1]))
             self.qvel[ids] = rng.normal(0, noise, (len(ids), self.qvel.shape[1]))
@@ -318,7 +322,7 @@ class Robots:
         before, clock = self.qpos[:, :2].copy(), self.time.copy()
         self.ctrl[:] = action
         self.batch.step(nstep=FRAME_SKIP)
-        unstable = (self.time <= clock).reshape(-1) | ~np.isfinite(self.qpos).all(1)  # an automatic reset sets the clock back
+        unstable = (self.time <= clock).reshape(-1) | ~np.isfinite(self.qpos).all(1)
         return torch.from_numpy((self.qpos[:, :2] - before).astype(np.float32)), unstable
 
 
@@ -381,7 +385,6 @@ plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.righ
 
 def save_figure(figure, out, name):
     path = Path(out) / "figures" / f"{name}.png"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    write_whole(path, lambda file: figure.savefig(file, format="png"))
     plt.close(figure)
     print(f"wrote figures/{path.name}")

@@ -1,0 +1,187 @@
+"""Stage 3: the Ant against Gymnasium's model file, Batch against mj_step, SAC against a plain version, resuming."""
+import importlib.util
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import common
+import mujoco
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT, cli
+from torch import distributions as D
+from torch import nn
+
+
+@pytest.fixture(scope="module")
+def gymnasium_ant():
+    folder = Path(importlib.util.find_spec("gymnasium").origin).parent
+    return mujoco.MjModel.from_xml_path(str(folder / "envs/mujoco/assets/ant.xml"))
+
+
+# ---------------------------------------------------------------- the robot
+
+FIELDS = """nq nv nu nbody njnt ngeom qpos0 body_parentid body_pos body_quat body_mass body_inertia body_ipos body_iquat
+jnt_type jnt_axis jnt_pos jnt_range jnt_limited jnt_stiffness jnt_solref jnt_solimp jnt_margin dof_armature dof_damping dof_frictionloss
+geom_type geom_size geom_pos geom_quat geom_friction geom_condim geom_contype geom_conaffinity geom_margin geom_gap geom_solref geom_solimp
+geom_bodyid geom_priority actuator_trntype actuator_trnid actuator_gear actuator_ctrlrange actuator_ctrllimited actuator_gaintype
+actuator_gainprm actuator_biastype actuator_biasprm actuator_dyntype actuator_forcelimited""".split()
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_ant_is_gymnasiums_field_by_field(field, gymnasium_ant):
+    np.testing.assert_allclose(getattr(common.ant_spec().compile(), field), getattr(gymnasium_ant, field), atol=1e-12)
+
+
+def test_ants_physics_options_and_rest_pose_are_gymnasiums(gymnasium_ant):
+    ours = common.ant_spec().compile()
+    for field in ("timestep", "integrator", "gravity", "solver", "cone", "iterations", "tolerance", "density", "viscosity", "impratio"):
+        np.testing.assert_array_equal(getattr(ours.opt, field), getattr(gymnasium_ant.opt, field), field)
+    np.testing.assert_array_equal(common.REST, gymnasium_ant.numeric("init_qpos").data)
+
+
+def test_robots_equal_a_plain_loop_over_gymnasiums_ant(gymnasium_ant):
+    robots, data, rng = common.Robots(common.ant_spec(), 3), mujoco.MjData(gymnasium_ant), np.random.default_rng(0)
+    robots.reset(np.array([1]), rng)
+    data.qpos[:], data.qvel[:] = robots.qpos[1], robots.qvel[1]
+    for _ in range(40):
+        action = rng.uniform(-1, 1, (3, 8)).astype(np.float32)
+        displacement, unstable = robots.step(action)
+        data.ctrl[:] = action[1]
+        start = data.qpos[:2].copy()
+        for _ in range(5):
+            mujoco.mj_step(gymnasium_ant, data)
+        assert not unstable.any()
+        np.testing.assert_allclose(displacement[1], data.qpos[:2] - start, atol=1e-6)
+    np.testing.assert_allclose(robots.qpos[1], data.qpos, atol=1e-9)
+    np.testing.assert_allclose(robots.observe()[1], np.r_[data.qpos[2:], data.qvel], atol=1e-5)
+
+
+def test_mirrored_ant_mirrors_its_walk():
+    """The Ant mirrored at the x-axis (legs 1 and 4, 2 and 3 swapped) under mirrored actions moves by the mirrored displacement."""
+    robots, rng = common.Robots(common.ant_spec(), 2), np.random.default_rng(0)
+    hips, ankles = [6, 2, 4, 0], [7, 3, 5, 1]  # of legs 1 to 4 among the actuators, which go 4 1 2 3 ... below
+    order = {1: (2, 3), 2: (4, 5), 3: (6, 7), 4: (0, 1)}  # leg -> (hip, ankle) actuator
+    swap = {1: 4, 2: 3, 3: 2, 4: 1}
+    del hips, ankles
+    for _ in range(30):
+        action = rng.uniform(-1, 1, 8)
+        mirrored = np.zeros(8)
+        for leg, (hip, ankle) in order.items():
+            mirrored[order[swap[leg]][0]] = -action[hip]   # hips turn about z: mirrored they turn the other way
+            mirrored[order[swap[leg]][1]] = action[ankle]  # bent legs stay bent: the ranges of 1 and 4, 2 and 3 agree in sign
+        displacement, _ = robots.step(np.stack([action, mirrored]))
+        np.testing.assert_allclose(displacement[1], displacement[0] * torch.tensor([1.0, -1.0]), atol=1e-6)
+    assert abs(displacement).max() > 1e-3
+
+
+def test_an_unstable_simulation_is_noticed_and_the_others_go_on():
+    robots = common.Robots(common.ant_spec(), 3)
+    robots.qvel[1] = 1e12
+    displacement, unstable = robots.step(np.zeros((3, 8)))
+    assert unstable.tolist() == [False, True, False] and torch.isfinite(displacement[[0, 2]]).all()
+    robots.reset(np.flatnonzero(unstable))
+    assert not robots.step(np.zeros((3, 8)))[1].any()
+
+
+# ---------------------------------------------------------------- reward and SAC
+
+def test_reward_is_the_scaled_log_likelihood_up_to_its_maximum(s3):
+    torch.manual_seed(0)
+    decoder, z, displacement = common.Decoder(3), torch.randn(40, 2), 0.1 * torch.randn(40, 2)
+    mean, log_var = decoder(torch.cat([z, torch.zeros(40, 1)], 1), 1)
+    for floor in (0.0, 10.0):  # without a floor: App. A.1.3; far above every deviation: the floor alone
+        std = (log_var[:, 0].exp() / 20).sqrt() if floor == 0 else torch.tensor(floor)
+        p = D.Independent(D.Normal(mean[:, 0] / 10, std.expand(40, 2)), 1)
+        torch.testing.assert_close(s3.reward(decoder, z, displacement, floor), 0.1 * (p.log_prob(displacement) - p.log_prob(mean[:, 0] / 10)))
+
+
+def test_sac_gradients_equal_a_plain_version(s3):
+    """Against two separate critics, frozen parameters and three separate backward passes, term by term from the paper of SAC."""
+    torch.manual_seed(0)
+    s3.HIDDEN = 32
+    actor, critics = common.Actor(5, 2, 3, 32), s3.Critics(10)
+    value, target = s3.value_network(7), s3.value_network(7)
+    x, a, x2, r = torch.randn(64, 7), torch.rand(64, 3) * 2 - 1, torch.randn(64, 7), torch.randn(64)
+    torch.manual_seed(1)
+    sum(s3.sac_losses(actor, critics, value, target.requires_grad_(False), x, a, x2, r)).backward()
+    ours = [p.grad.clone() for p in [*actor.net.parameters(), *value.parameters(), *critics.parameters()]]
+    for p in [*actor.parameters(), *value.parameters(), *critics.parameters()]:
+        p.grad = None
+
+    plain = [nn.Sequential(nn.Linear(10, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, 1)) for _ in range(2)]
+    for k, net in enumerate(plain):
+        for i, layer in enumerate((net[0], net[2], net[4])):
+            layer.weight.data, layer.bias.data = critics.weights[i][k].T.detach().clone(), critics.biases[i][k, 0].detach().clone()
+    q = lambda net, action: net(torch.cat([x, action], 1)).squeeze(1)  # noqa: E731
+    torch.testing.assert_close(critics(x, a), torch.stack([q(net, a) for net in plain]))
+    backup = r + s3.DISCOUNT * target(x2).squeeze(1)
+    sum(0.5 * nn.functional.mse_loss(q(net, a), backup) for net in plain).backward()
+    critic_grads = [torch.stack([net[i].weight.grad.T for net in plain]) for i in (0, 2, 4)]
+    critic_grads += [torch.stack([net[i].bias.grad[None] for net in plain]) for i in (0, 2, 4)]
+    torch.manual_seed(1)
+    a_new, log_prob = actor(x)
+    smaller = torch.min(q(plain[0], a_new), q(plain[1], a_new))
+    (s3.TEMPERATURE * log_prob - smaller).mean().backward()
+    (0.5 * nn.functional.mse_loss(value(x).squeeze(1), (smaller - s3.TEMPERATURE * log_prob).detach())).backward()
+    expected = [p.grad for p in [*actor.net.parameters(), *value.parameters()]] + critic_grads
+    for found, wanted in zip(ours, expected):
+        torch.testing.assert_close(found, wanted, atol=1e-6, rtol=1e-4)
+
+
+# ---------------------------------------------------------------- measures and the relation function
+
+def test_tracking_numbers_by_hand(s3):
+    angle, speed = np.tile(np.radians([-60, -30, 0, 30, 60]), 5), np.repeat([1.0, 2, 3, 4, 5], 5)
+    predicted = speed[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    turned = angle + np.radians(10)
+    executed = 0.9 * speed[:, None] * np.stack([np.cos(turned), np.sin(turned)], 1)
+    error, degrees, ratio = s3.tracking(executed, predicted)
+    assert error == pytest.approx(np.sqrt(1 + 0.81 - 1.8 * np.cos(np.radians(10))))
+    np.testing.assert_allclose(degrees, 10)
+    np.testing.assert_allclose(ratio, 0.9 * np.cos(np.radians(10)))
+
+
+def test_relation_is_recovered_from_a_decoder_that_has_one(s3, monkeypatch):
+    """A stand-in decoder whose heading is 0.6 z_dir and turns by 0.21 z_cur a step: the weight is 0.35."""
+    def decode(z, steps):
+        heading = 0.6 * z[:, 1, None] + 0.21 * z[:, 2, None] * torch.arange(steps)
+        return torch.stack([heading.cos(), heading.sin()], 2), None
+    weight, mismatch = s3.calibrate_relation(decode)
+    assert weight == pytest.approx(0.35, abs=1e-3) and mismatch(weight) < 0.1 < mismatch(0.2)
+
+
+# ---------------------------------------------------------------- the command line
+
+def test_killed_training_resumes_to_the_same_bits(tmp_path):
+    flags = ["--threads", 1, "--updates", 240, "--checkpoint", 0, "--warm_up", 1000, "--replay", 5000, "--hidden", 64]
+    whole = cli("03_train_policy", "--out", tmp_path / "whole", *flags)
+    assert whole.returncode == 0, whole.stderr
+    process = subprocess.Popen([sys.executable, str(ROOT / "03_train_policy.py"), "--out", str(tmp_path / "cut"), *map(str, flags)],
+                               stdout=subprocess.PIPE, text=True)
+    for _ in range(6):  # some checkpoints have been written by the sixth line
+        process.stdout.readline()
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    time.sleep(0.1)
+    first = torch.load(tmp_path / "cut/runs/checkpoint_ant_semi_seed0.pt", weights_only=True)["updates"]
+    assert 0 < first < 240
+    resumed = cli("03_train_policy", "--out", tmp_path / "cut", "--resume", "true", *flags)
+    assert resumed.returncode == 0, resumed.stderr
+    a, b = (torch.load(tmp_path / out / "runs/policy_ant_semi_seed0.pt", weights_only=True) for out in ("whole", "cut"))
+    assert all(torch.equal(a["actor"][k], b["actor"][k]) for k in a["actor"])
+    assert (a["updates"], a["env_steps"], len(a["curve"])) == (b["updates"], b["env_steps"], len(b["curve"]))
+    row, = common.read_csv(tmp_path / "cut/results/policies.csv")
+    assert row["experiment"] == "ant_semi" and int(row["updates"]) == a["updates"]
+    assert (tmp_path / "cut/figures/fig05_skills_wedis.png").stat().st_size > 10_000
+
+
+def test_a_nan_in_training_is_named_and_nothing_is_overwritten(tmp_path):
+    flags = ["--out", tmp_path, "--updates", 80, "--checkpoint", 0, "--warm_up", 1000, "--replay", 5000, "--hidden", 32]
+    done = cli("03_train_policy", *flags, "--learning_rate", 1e30)
+    assert done.returncode == 1 and "losses" in done.stderr and "--resume true" in done.stderr and done.stderr.count("\n") == 1, done.stderr
+    assert not (tmp_path / "runs/policy_ant_semi_seed0.pt").exists()

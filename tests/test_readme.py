@@ -1,0 +1,87 @@
+"""The README's tables are made from results/*.csv. `python tests/test_readme.py` writes them; the tests hold them together."""
+import re
+from itertools import groupby
+
+import common
+import numpy as np
+import pytest
+from conftest import ROOT, script
+
+README = ROOT / "README.md"
+
+
+def num(text, form):
+    return format(float(text), form)
+
+
+def tables():
+    """Markdown of each table, from the CSV files alone."""
+    results = {name: common.read_csv(ROOT / "results" / f"{name}.csv") for name in ("wetvae", "policies", "mazes")}
+    wetvae = ["| model | axis | \\|corr\\| | purity | decoded range over z in [-1.5, 1.5] | MIG | SAP | seed |", "|---|---|---|---|---|---|---|---|"]
+    for r in results["wetvae"]:
+        unit = "" if r["factor"] == "speed" else "°"
+        wetvae.append(f"| {'trajectory VAE' if r['labels'] == 'none' else 'WET-VAE'} | {r['factor']} | {num(r['abs_corr'], '.2f')} | "
+                      f"{num(r['purity'], '.2f')} | {num(r['range_low'], '.2f')}{unit} .. {num(r['range_high'], '.2f')}{unit} | "
+                      f"{num(r['mig'], '.2f')} | {num(r['sap'], '.2f')} | {r['seed']} |")
+    policies = ["| policy | seed | updates | minutes | tracking error, mean actions | sampled | direction error | speed ratio slow / middle / fast "
+                "| flips of 25 | executed purity speed / direction / curvature |", "|---|---|---|---|---|---|---|---|---|---|"]
+    for r in results["policies"]:
+        policies.append(f"| {r['experiment']} | {r['seed']} | {r['updates']} | {num(r['train_minutes'], '.0f')} | {num(r['tracking_error'], '.3f')} | "
+                        f"{num(r['tracking_error_sampled'], '.3f')} | {num(r['direction_error_deg'], '.1f')}° | {num(r['speed_ratio_slow'], '.2f')} / "
+                        f"{num(r['speed_ratio_mid'], '.2f')} / {num(r['speed_ratio_fast'], '.2f')} | {r['flips']} | {num(r['purity_speed'], '.2f')} / "
+                        f"{num(r['purity_direction'], '.2f')} / {num(r['purity_curvature'], '.2f')} |")
+    stage = script("04_mpc_maze")
+    key = lambda r: (r["maze"], r["objective"], r["reward"], r["prediction"], r["seed"])  # noqa: E731
+    ordered = sorted(results["mazes"], key=lambda r: (r["maze"], r["objective"], r["reward"], r["prediction"] == "decoder", r["seed"]))
+    mazes = stage.HEADER.split("\n") + [stage.summary(list(rows)) for _, rows in groupby(ordered, key)]
+    return dict(wetvae=wetvae, policies=policies, mazes=mazes)
+
+
+def between(name):
+    return re.compile(rf"(<!-- table {name} -->\n)(.*?)(<!-- end -->)", re.S)
+
+
+@pytest.mark.parametrize("name", ["wetvae", "policies", "mazes"])
+def test_tables_are_those_of_the_results(name):
+    assert between(name).search(README.read_text())[2].strip().split("\n") == tables()[name]
+
+
+def test_every_linked_file_exists():
+    for link in re.findall(r"\]\(([^)#]+)\)", README.read_text()):
+        assert (ROOT / link).exists(), link
+
+
+def test_every_function_named_beside_the_paper_exists():
+    rows = [line for line in README.read_text().split("\n") if re.search(r"\]\((0[1-4]|common)", line)]
+    assert len(rows) >= 12
+    for row in rows:
+        for path, names in re.findall(r"\]\((\w+\.py)\)((?: `\w+`,?)+)", row):
+            source = (ROOT / path).read_text()
+            for name in re.findall(r"`(\w+)`", names):
+                assert re.search(rf"^(def|class) {name}\b|^{name} =", source, re.M), f"{name} in {path}"
+
+
+def test_pretrained_policy_still_tracks_as_its_row_says(s3, tmp_path):
+    """The committed weights, run again, give the committed number (contacts make single roll-outs chaotic across machines)."""
+    policy = common.load(tmp_path, "policy", "ant_semi", 0)
+    row, = [r for r in common.read_csv(ROOT / "results/policies.csv") if r["experiment"] == "ant_semi" and r["seed"] == "0"]
+    executed, commanded, flipped = s3.grid_run(common.load_actor(policy), common.load_decoder(policy))
+    error, degrees, _ = s3.tracking(executed, commanded)
+    assert abs(error - float(row["tracking_error"])) < 0.03 and flipped.sum() == int(row["flips"])
+    assert abs(degrees[2:].mean() - float(row["direction_error_deg"])) < 2
+
+
+def test_pretrained_decoder_has_the_purity_its_row_says(s2, tmp_path):
+    decoder = common.load_decoder(common.load(tmp_path, "wetvae", "main", 0))
+    names = list(common.FULL_RANGE)
+    _, purity = common.cross_talk([common.factors_of(s2.traverse(decoder, i, np.linspace(-1.5, 1.5, 61), 5)) for i in range(3)], names)
+    rows = {r["factor"]: float(r["purity"]) for r in common.read_csv(ROOT / "results/wetvae.csv")
+            if (r["experiment"], r["seed"]) == ("main", "0") and r["labels"] != "none"}
+    np.testing.assert_allclose(purity, [rows[name] for name in names], atol=1e-3)
+
+
+if __name__ == "__main__":
+    text = README.read_text()
+    for name, lines in tables().items():
+        text = between(name).sub(lambda m, lines=lines: m[1] + "\n".join(lines) + "\n" + m[3], text)
+    README.write_text(text)
