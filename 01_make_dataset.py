@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 import common
-from common import parse_flags, plt, save, save_figure, weak_labels
+from common import parse_flags, plt, save, save_figure, stop, weak_labels
 
 EXPERIMENT = "main"     # row of EXPERIMENTS below
 SEED = 0                # random seed
@@ -65,6 +65,8 @@ def draw_fig09(trajectories, factors):
 
 if __name__ == "__main__":
     config = parse_flags(globals())
+    if min(TRAJECTORIES, LENGTH) < 1 or STRAIGHT > 1 or SPEED_LOW > SPEED_HIGH:
+        stop("--trajectories and --length must be at least 1, --straight at most 1, --speed_low at most --speed_high")
     rng = np.random.default_rng(SEED)
     factors = {
         "speed": rng.uniform(SPEED_LOW, SPEED_HIGH, TRAJECTORIES),

@@ -16,13 +16,15 @@ from torch import nn
 from torch.nn import functional as F
 
 import common
-from common import (LABEL_RULES, Decoder, cross_talk, factors_of, gaussian_log_prob, load, load_decoder, parse_flags,
-                    plt, save, save_figure, stop, update_csv, weak_labels)
+from common import (LABEL_RULES, Decoder, artifact_name, check_same, cross_talk, factors_of, gaussian_log_prob, load, load_decoder,
+                    parse_flags, plt, resumable, save, save_figure, stop, update_csv, weak_labels)
 
 EXPERIMENT = "main"    # row of EXPERIMENTS below
 SEED = 0               # random seed
 OUT = "."              # folder for runs/, figures/ and results/
 TRAIN = True           # false: only draw and measure what is already trained
+RESUME = False         # true: continue from the last checkpoint
+CHECKPOINT = 1.0       # minutes between checkpoints
 
 DATA = "main"          # experiment of 01 to train on
 DATA_SEED = 0          # and its seed
@@ -70,32 +72,45 @@ def objective(encoder, decoder, classifiers, x, y, sizes):
     return states, labels, kl
 
 
-def train(x, y, sizes, z_dim):
+def train(x, y, sizes, z_dim, variant, config):
     """Maximise Eq. 4. x (N, T, x_dim) displacements, y (N, M) classes, sizes: number of classes of each label (none: [])."""
     torch.manual_seed(SEED)
     encoder, decoder = Encoder(x.shape[2], sum(sizes), z_dim), Decoder(z_dim, x.shape[2], HIDDEN)
     classifiers = nn.ModuleList(nn.Sequential(nn.Linear(z_dim, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, k)) for k in sizes)
-    parameters = [*encoder.parameters(), *decoder.parameters(), *classifiers.parameters()]
-    optimizer = torch.optim.Adam(parameters, lr=LEARNING_RATE, fused=True)
-    updates, done, start = EPOCHS * (len(x) // BATCH), 0, time.time()
-    for epoch in range(EPOCHS):
-        for rows in torch.randperm(len(x))[:len(x) // BATCH * BATCH].view(-1, BATCH):
+    model = nn.ModuleList([encoder, decoder, classifiers])
+    optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE, fused=True)
+    epoch, seconds, last_save, per_epoch = 0, 0.0, time.time(), len(x) // BATCH
+    if resumable(OUT, "wetvae-checkpoint", variant, SEED, RESUME):
+        state = load(OUT, "wetvae-checkpoint", variant, SEED)
+        check_same(state["config"], config, but="RESUME OUT THREADS CHECKPOINT BASELINE")
+        model.load_state_dict(state["model"])
+        optimizer.load_state_dict(state["optimizer"])
+        epoch, seconds = state["epoch"], state["seconds"]
+        torch.set_rng_state(state["rng"])
+    while epoch < EPOCHS:
+        clock = time.time()
+        for i, rows in enumerate(torch.randperm(len(x))[:per_epoch * BATCH].view(per_epoch, BATCH)):
             for group in optimizer.param_groups:
-                group["lr"] = LEARNING_RATE * (1 - done / updates)
+                group["lr"] = LEARNING_RATE * (1 - (epoch + i / per_epoch) / EPOCHS)
             states, labels, kl = objective(encoder, decoder, classifiers, x[rows], y[rows], sizes)
             loss = -(states + GAMMA * labels - BETA * kl)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
-            done += 1
+        epoch += 1
+        seconds += time.time() - clock
         if not math.isfinite(loss.item()):
-            stop(f"loss is {loss.item()} in epoch {epoch + 1}; nothing was saved; lower --learning_rate", code=1)
-        if (epoch + 1) % 5 == 0 or epoch + 1 == EPOCHS:
-            seconds = time.time() - start
-            print(f"epoch {epoch + 1:3d}/{EPOCHS}  objective {-loss.item():8.3f}  log p(tau|z) {states.item():7.3f}  log p(y|z) "
-                  f"{labels.item():7.3f}  KL {kl.item():6.3f}  {done / seconds:4.0f} updates/s  "
-                  f"{seconds * (updates / done - 1):4.0f} s left", flush=True)
-    return encoder, decoder, time.time() - start
+            stop(f"the loss is {loss.item()} in epoch {epoch}; nothing was overwritten: go on from the last good "
+                 f"{artifact_name('wetvae-checkpoint', variant, SEED)} with --resume true, or lower --learning_rate", code=1)
+        if epoch % 4 == 0 or epoch == EPOCHS:
+            print(f"epoch {epoch:3d}/{EPOCHS}  objective {-loss.item():8.3f}  log p(tau|z) {states.item():7.3f}  log p(y|z) "
+                  f"{labels.item():7.3f}  KL {kl.item():6.3f}  {epoch * per_epoch / seconds:4.0f} updates/s  "
+                  f"{seconds * (EPOCHS / epoch - 1):4.0f} s left", flush=True)
+        if time.time() - last_save >= 60 * CHECKPOINT or epoch == EPOCHS:
+            save(OUT, "wetvae-checkpoint", variant, SEED, config, model=model.state_dict(), optimizer=optimizer.state_dict(),
+                 epoch=epoch, seconds=seconds, rng=torch.get_rng_state())
+            last_save = time.time()
+    return encoder, decoder, seconds
 
 
 def one_hot_labels(y, sizes):
@@ -208,7 +223,8 @@ if __name__ == "__main__":
             y = torch.from_numpy(weak_labels(dict(zip(names, factors.T.astype(np.float64))), label_names))
         if TRAIN:
             print(f"\n{variant}: {'WET-VAE' if label_names else 'trajectory VAE, no labels'}, beta {BETA:g}, gamma {GAMMA:g}, seed {SEED}")
-            encoder, decoder, seconds = train(x[:len(x) - HELD_OUT], y[:len(x) - HELD_OUT], sizes, len(names))
+            train_set = slice(len(x) - HELD_OUT)
+            encoder, decoder, seconds = train(x[train_set], y[train_set], sizes, len(names), variant, config)
             with torch.no_grad():
                 mean, _ = encoder(x[test], one_hot_labels(y[test], sizes))
             decoder.axes, abs_corr = match_axes(mean.numpy(), factors[test])

@@ -13,8 +13,8 @@ import torch
 from torch import nn
 
 import common
-from common import (FULL_RANGE, STEP_SCALE, Actor, Robots, ant_spec, cross_talk, execute, factors_of, load, load_actor,
-                    load_decoder, parse_flags, plt, predict, save, save_figure, stop, update_csv)
+from common import (FULL_RANGE, STEP_SCALE, Actor, Robots, ant_spec, artifact_name, check_same, cross_talk, execute, factors_of, load,
+                    load_actor, load_decoder, parse_flags, plt, predict, resumable, save, save_figure, stop, update_csv)
 
 EXPERIMENT = "ant_semi"  # row of EXPERIMENTS below
 SEED = 0                 # random seed
@@ -49,6 +49,8 @@ REWARD_SCALE = 0.1       # the paper: 1
 VARIANCE_SCALE = 0.05    # decoder variance -> square metres, App. A.1.3: 1/20
 FLOOR_START = 0.04       # metres, least standard deviation of the reward: a sharp one makes standing still a trap
 FLOOR_END = 0.01         # shrinks to this between half and nine tenths of the updates: teaches the slow skills
+
+COVERAGE = 200           # random skills whose visited cells of 1 m are counted at the end
 
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
     "ant_semi": {},
@@ -219,11 +221,9 @@ def train(decoder, config):
     seconds, curve = 0.0, []
     robots.reset(np.arange(ROBOTS), rng)
 
-    if RESUME:
-        state = load(OUT, "checkpoint", EXPERIMENT, SEED)
-        for name in set(config) - {"RESUME", "OUT", "THREADS", "CHECKPOINT", "UPDATES", "MINUTES"}:
-            if state["config"].get(name) != config[name]:
-                stop(f"the checkpoint was made with --{name.lower()} {state['config'].get(name)}, not {config[name]}; resume with the same")
+    if resumable(OUT, "policy-checkpoint", EXPERIMENT, SEED, RESUME):
+        state = load(OUT, "policy-checkpoint", EXPERIMENT, SEED)
+        check_same(state["config"], config, but="RESUME OUT THREADS CHECKPOINT UPDATES MINUTES")
         networks.load_state_dict(state["networks"])
         target.load_state_dict(state["target"])
         optimizer.load_state_dict(state["optimizer"])
@@ -236,7 +236,7 @@ def train(decoder, config):
         rng.bit_generator.state = state["numpy_rng"]
 
     def checkpoint():
-        save(OUT, "checkpoint", EXPERIMENT, SEED, config, networks=networks.state_dict(), target=target.state_dict(),
+        save(OUT, "policy-checkpoint", EXPERIMENT, SEED, config, networks=networks.state_dict(), target=target.state_dict(),
              optimizer=optimizer.state_dict(), replay=replay[:min(env_steps, REPLAY)].clone(), z=z, age=torch.from_numpy(age),
              updates=updates, env_steps=env_steps, unstable=unstable, seconds=seconds, curve=curve, torch_rng=torch.get_rng_state(),
              robots={k: torch.from_numpy(robots.batch.bind(k).copy()) for k in ("qpos", "qvel", "ctrl", "time", "qacc_warmstart")},
@@ -247,14 +247,17 @@ def train(decoder, config):
         curve.append(dict(updates=updates, env_steps=env_steps, minutes=seconds / 60, tracking_error=float(error), reward=r.mean().item(),
                           direction_deg=float(degrees[2:].mean()), speed_slow=float(ratio[:2].mean()), speed_mid=float(ratio[2]),
                           speed_fast=float(ratio[3:].mean())))
-        update_csv(Path(OUT) / "results" / f"learning_curve_{EXPERIMENT}_seed{SEED}.csv", curve, ("updates",))
+        update_csv(Path(OUT) / "results" / f"learning_curve_{EXPERIMENT}_seed{SEED}.csv", curve, ())
         print(f"{updates:7d} updates {env_steps:8d} steps  tracking error {error:.3f}  direction {degrees[2:].mean():5.1f} deg  speed x "
               f"{ratio[:2].mean():.2f} {ratio[2]:.2f} {ratio[3:].mean():.2f}  reward {r.mean():6.3f}  floor {floor:.3f}  "
               f"{updates / seconds:4.0f} updates/s  {seconds / 60 * (1 / progress - 1):4.0f} min left", flush=True)
 
-    progress, last_save, next_report = 0.0, time.time(), updates + UPDATES // 40
+    def share_done():
+        return seconds / 60 / MINUTES if MINUTES else updates / UPDATES
+
+    progress, last_save, interval = share_done(), time.time(), max(1, UPDATES // 40)
     while progress < 1:
-        clock = time.time()
+        clock, before = time.time(), updates
         # Collect: one step of every robot
         fresh = age % SKILL_STEPS == 0
         z[fresh] = torch.randn(int(fresh.sum()), z_dim)  # Alg. 1: sample z_single from the prior
@@ -282,7 +285,7 @@ def train(decoder, config):
 
         # Improve: a few updates
         for _ in range(UPDATES_PER_STEP):
-            progress = seconds / 60 / MINUTES if MINUTES else updates / UPDATES
+            progress = share_done()
             floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** min(1, max(0, (progress - 0.5) / 0.4))
             for group in optimizer.param_groups:
                 group["lr"] = LEARNING_RATE * min(1, max(0, 2 * (1 - progress)))
@@ -299,11 +302,11 @@ def train(decoder, config):
             updates += 1
         seconds += time.time() - clock
 
-        if updates >= next_report or progress >= 1:
-            next_report += UPDATES // 40
-            if not all(math.isfinite(loss.item()) for loss in losses):
-                stop(f"losses {[loss.item() for loss in losses]} after {updates} updates; the last good checkpoint stays: "
-                     "continue it with --resume true, or lower --learning_rate", code=1)
+        if updates // interval > before // interval or progress >= 1:
+            for name, metric in zip(("actor loss", "critic loss", "value loss", "reward"), (*losses, r.mean())):
+                if not math.isfinite(metric.item()):
+                    stop(f"{name} is {metric.item()} after {updates} updates; nothing was overwritten: go on from the last good "
+                         f"{artifact_name('policy-checkpoint', EXPERIMENT, SEED)} with --resume true, or lower --learning_rate", code=1)
             report()
             if time.time() - last_save > 60 * CHECKPOINT:
                 checkpoint()
@@ -321,8 +324,8 @@ if __name__ == "__main__":
     decoder = load_decoder(decoder_content)
     weight, mismatch = calibrate_relation(decoder)
     if TRAIN:
-        if not BATCH <= WARM_UP <= REPLAY:
-            stop(f"--warm_up {WARM_UP} must lie between --batch {BATCH} and --replay {REPLAY}")
+        if not BATCH <= WARM_UP <= REPLAY or not UPDATES:
+            stop(f"--updates must be at least 1 and --warm_up {WARM_UP} must lie between --batch {BATCH} and --replay {REPLAY}")
         try:
             trained = train(decoder, config)
         except KeyboardInterrupt:
@@ -347,7 +350,7 @@ if __name__ == "__main__":
     curves = [factors_of(np.diff(paths(actor, traversal(i, np.linspace(-1.5, 1.5, 13)), 5, 40, weight)[:, ::40], axis=1) / (40 * STEP_SCALE))
               for i in range(3)]
     C, purity = cross_talk(curves, names)
-    skills = nn.functional.pad(torch.randn(200, 2), (0, 1))
+    skills = nn.functional.pad(torch.randn(COVERAGE, 2), (0, 1))
     coverage = len(np.unique(np.floor(paths(actor, skills, 1, EPISODE, 0.0).reshape(-1, 2)), axis=0))
     print(f"\ntracking error {error:.3f} (mean actions), {error_sampled:.3f} (sampled actions); flips {flipped.sum()} of 25")
     print("z_speed              -1.5  -0.75      0   0.75    1.5")
@@ -355,7 +358,7 @@ if __name__ == "__main__":
     print("achieved/commanded  " + " ".join(f"{v:6.2f}" for v in ratio))
     print("executed cross-talk, purity: " + "; ".join(f"z_{n} " + " ".join(f"{c:.2f}" for c in row) + f" purity {p:.2f}"
                                                        for n, row, p in zip(names, C, purity)))
-    print(f"coverage of 200 random skills: {coverage} cells of 1 m")
+    print(f"coverage of {COVERAGE} random skills: {coverage} cells of 1 m")
     update_csv(Path(OUT) / "results" / "policies.csv", [dict(
         experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy["updates"], env_steps=policy["env_steps"],
         train_minutes=policy["seconds"] / 60, tracking_error=error, tracking_error_sampled=error_sampled,

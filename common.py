@@ -9,12 +9,12 @@ import ast
 import contextlib
 import csv
 import ctypes.util
+import hashlib
 import io
 import json
 import math
 import os
 import sys
-import zipfile
 from pathlib import Path
 
 if sys.platform == "linux" and "MUJOCO_GL" not in os.environ:  # off-screen rendering; must be set before mujoco loads, and
@@ -32,8 +32,7 @@ import matplotlib.pyplot as plt  # noqa: E402
 
 HERE = Path(__file__).parent
 FORMAT = 1  # artifact format; raise it when what is stored changes meaning
-SCRIPT = {"dataset": "01_make_dataset.py", "wetvae": "02_train_wetvae.py", "policy": "03_train_policy.py",
-          "checkpoint": "03_train_policy.py"}
+SCRIPT = {"dataset": "01_make_dataset.py", "wetvae": "02_train_wetvae.py", "policy": "03_train_policy.py"}
 
 
 # ---------------------------------------------------------------- command line
@@ -92,6 +91,29 @@ def artifact_name(kind, experiment, seed):
     return f"{kind}_{experiment}_seed{seed}" + (".npz" if kind == "dataset" else ".pt")
 
 
+def leaves(content):
+    """Every array and plain value in an artifact, depth first, keys sorted: what a checksum is taken of."""
+    if isinstance(content, dict):
+        content = [part for key in sorted(content, key=str) for part in (str(key), content[key])]
+    if isinstance(content, (list, tuple)):
+        for part in content:
+            yield from leaves(part)
+    else:
+        yield content.numpy() if isinstance(content, torch.Tensor) else content
+
+
+def checksum(content):
+    """SHA-256 over all of it but the entry "sha256": a changed byte that zip and torch let pass is noticed all the same."""
+    sha = hashlib.sha256()
+    for leaf in leaves({key: value for key, value in content.items() if key != "sha256"}):
+        if isinstance(leaf, np.ndarray):
+            sha.update(f"{leaf.dtype}{leaf.shape}".encode())
+            sha.update(np.ascontiguousarray(leaf).tobytes())
+        else:
+            sha.update(repr(leaf).encode() + b"\0")
+    return sha.hexdigest()
+
+
 def write_whole(path, write):
     """write(file) to path, whole or not at all: a reader sees the old file or the new one, never half of one."""
     partial = path.with_name(path.name + ".partial")
@@ -111,6 +133,7 @@ def save(out, kind, experiment, seed, config, **content):
     path = Path(out) / "runs" / artifact_name(kind, experiment, seed)
     meta = dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed, config=config,
                 versions=dict(torch=str(torch.__version__), mujoco=mujoco.__version__, numpy=np.__version__))
+    meta["sha256"] = checksum(meta | content)
     write_whole(path, lambda file: np.savez(file, meta=json.dumps(meta), **content) if kind == "dataset"
                 else torch.save(meta | content, file))
     return path
@@ -119,7 +142,7 @@ def save(out, kind, experiment, seed, config, **content):
 def load(out, kind, experiment, seed, quiet=False):
     """Read an artifact from runs/, else pretrained/, and say which was taken. Exits with 2 and one line if it is not sound."""
     name = artifact_name(kind, experiment, seed)
-    make = f"make it with: python {SCRIPT[kind]} --experiment {experiment} --seed {seed}"
+    make = f"make it with: python {SCRIPT[kind.partition('-')[0]]} --experiment {experiment} --seed {seed}"
     path = next((p for p in (Path(out) / "runs" / name, HERE / "pretrained" / name) if p.exists()), None)
     if path is None:
         stop(f"no {name} in runs/ or pretrained/; {make}")
@@ -129,18 +152,37 @@ def load(out, kind, experiment, seed, quiet=False):
                 content = {key: file[key] for key in file.files}
             content |= json.loads(str(content.pop("meta")))
         else:
-            with zipfile.ZipFile(path) as file:  # torch does not check the archive's checksums, zipfile does
-                if file.testzip():
-                    raise ValueError
             content = torch.load(path, weights_only=True)
-    except Exception:  # numpy, zipfile and torch raise a dozen kinds on a damaged file; every one means the same to a reader
+        found = {key: content.get(key) for key in ("format", "kind", "experiment", "seed")}
+        sound = content.get("sha256") == checksum(content)
+        finite = all(np.isfinite(leaf).all() for leaf in leaves(content) if isinstance(leaf, np.ndarray) and leaf.dtype.kind == "f")
+    except Exception:  # numpy, zipfile, json and torch raise a dozen kinds on a damaged file; all mean the same to a reader
         stop(f"{path} is not readable (truncated, damaged or not an artifact of this project); {make}")
     for key, wanted in dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed).items():
-        if (found := content.get(key)) != wanted:
-            stop(f"{path} has {key} {found!r} where {wanted!r} is needed; {make}")
+        if found[key] != wanted:
+            stop(f"{path} has {key} {found[key]!r} where {wanted!r} is needed; {make}")
+    if not sound:
+        stop(f"{path} is damaged (its checksum does not match); {make}")
+    if not finite:
+        stop(f"{path} holds numbers that are not finite; {make}")
     if not quiet:
         print(f"using {path.relative_to(HERE) if path.is_relative_to(HERE) else path}")
     return content
+
+
+def resumable(out, kind, experiment, seed, resume):
+    """Whether training is to go on from a checkpoint; one that was stopped before its first checkpoint begins anew."""
+    found = (Path(out) / "runs" / artifact_name(kind, experiment, seed)).exists()
+    if resume and not found:
+        print(f"no {artifact_name(kind, experiment, seed)} in runs/ yet: training from the beginning")
+    return resume and found
+
+
+def check_same(old, new, but):
+    """Exit with 2 unless a checkpoint's configuration is today's; `but` names the flags that may differ."""
+    for name in sorted(set(new) - set(but.split())):
+        if old.get(name) != new[name]:
+            stop(f"the checkpoint was made with --{name.lower()} {old.get(name)}, not {new[name]}; resume with the same, or without --resume")
 
 
 def update_csv(path, rows, key):

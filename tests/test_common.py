@@ -6,7 +6,7 @@ import common
 import numpy as np
 import pytest
 import torch
-from conftest import cli, script
+from conftest import script
 from torch import distributions as D
 
 
@@ -30,39 +30,6 @@ def test_every_constant_is_a_flag_with_its_comment(capsys):
         flags("--help")
     text = " ".join(capsys.readouterr().out.split())
     assert end.value.code == 0 and "--samples int N, skill sequences per plan [1000]" in text
-
-
-@pytest.mark.parametrize("argv, words", [
-    (["--sample", "3"], ["unknown flag --sample", "--samples"]),
-    (["--samples", "three"], ["--samples", "whole number"]),
-    (["--samples", "-3"], ["--samples"]),
-    (["--samples"], ["--samples", "expected one argument"]),
-    (["--z_range", "nan"], ["--z_range", "number"]),
-    (["--animate", "maybe"], ["--animate", "true or false"]),
-    (["--experiment", "nope"], ["unknown experiment 'nope'", "main"]),
-    (["extra"], ["unknown flag extra"]),
-])
-def test_bad_flags_get_one_line_and_exit_2(argv, words, capsys):
-    with pytest.raises(SystemExit) as end:
-        flags(*argv)
-    message = capsys.readouterr().err
-    assert end.value.code == 2 and message.count("\n") == 1
-    assert all(word in message for word in words), message
-
-
-@pytest.mark.parametrize("name, argv, words", [
-    ("01_make_dataset", ["--nonsense", "1"], ["unknown flag --nonsense", "--trajectories"]),
-    ("02_train_wetvae", ["--experiment", "nope"], ["unknown experiment", "main"]),
-    ("02_train_wetvae", [], ["no dataset_main_seed0.npz", "python 01_make_dataset.py --experiment main --seed 0"]),
-    ("03_train_policy", ["--decoder", "nope"], ["no wetvae_nope_seed0.pt", "python 02_train_wetvae.py --experiment nope --seed 0"]),
-    ("03_train_policy", ["--resume", "true"], ["no checkpoint_ant_semi_seed0.pt", "python 03_train_policy.py"]),
-    ("04_mpc_maze", ["--mazes", "maze1 mazeX"], ["unknown maze 'mazeX'", "maze2"]),
-    ("04_mpc_maze", ["--policy_seed", "99"], ["no policy_ant_semi_seed99.pt", "python 03_train_policy.py --experiment ant_semi --seed 99"]),
-])
-def test_bad_input_from_the_command_line(name, argv, words, tmp_path):
-    done = cli(name, "--out", tmp_path, *argv)
-    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "Traceback" not in done.stderr
-    assert all(word in done.stderr for word in words), done.stderr
 
 
 # ---------------------------------------------------------------- artifacts

@@ -1,9 +1,5 @@
-"""Stage 3: the Ant against Gymnasium's model file, Batch against mj_step, SAC against a plain version, resuming."""
+"""Stage 3: the Ant against Gymnasium's model file, Batch against mj_step, SAC against a plain version."""
 import importlib.util
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import common
@@ -11,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, cli
+from conftest import cli
 from torch import distributions as D
 from torch import nn
 
@@ -63,10 +59,8 @@ def test_robots_equal_a_plain_loop_over_gymnasiums_ant(gymnasium_ant):
 def test_mirrored_ant_mirrors_its_walk():
     """The Ant mirrored at the x-axis (legs 1 and 4, 2 and 3 swapped) under mirrored actions moves by the mirrored displacement."""
     robots, rng = common.Robots(common.ant_spec(), 2), np.random.default_rng(0)
-    hips, ankles = [6, 2, 4, 0], [7, 3, 5, 1]  # of legs 1 to 4 among the actuators, which go 4 1 2 3 ... below
     order = {1: (2, 3), 2: (4, 5), 3: (6, 7), 4: (0, 1)}  # leg -> (hip, ankle) actuator
     swap = {1: 4, 2: 3, 3: 2, 4: 1}
-    del hips, ankles
     for _ in range(30):
         action = rng.uniform(-1, 1, 8)
         mirrored = np.zeros(8)
@@ -156,32 +150,17 @@ def test_relation_is_recovered_from_a_decoder_that_has_one(s3, monkeypatch):
 
 # ---------------------------------------------------------------- the command line
 
-def test_killed_training_resumes_to_the_same_bits(tmp_path):
-    flags = ["--threads", 1, "--updates", 240, "--checkpoint", 0, "--warm_up", 1000, "--replay", 5000, "--hidden", 64]
-    whole = cli("03_train_policy", "--out", tmp_path / "whole", *flags)
-    assert whole.returncode == 0, whole.stderr
-    process = subprocess.Popen([sys.executable, str(ROOT / "03_train_policy.py"), "--out", str(tmp_path / "cut"), *map(str, flags)],
-                               stdout=subprocess.PIPE, text=True)
-    for _ in range(6):  # some checkpoints have been written by the sixth line
-        process.stdout.readline()
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    process.stdout.close()
-    time.sleep(0.1)
-    first = torch.load(tmp_path / "cut/runs/checkpoint_ant_semi_seed0.pt", weights_only=True)["updates"]
-    assert 0 < first < 240
-    resumed = cli("03_train_policy", "--out", tmp_path / "cut", "--resume", "true", *flags)
-    assert resumed.returncode == 0, resumed.stderr
-    a, b = (torch.load(tmp_path / out / "runs/policy_ant_semi_seed0.pt", weights_only=True) for out in ("whole", "cut"))
-    assert all(torch.equal(a["actor"][k], b["actor"][k]) for k in a["actor"])
-    assert (a["updates"], a["env_steps"], len(a["curve"])) == (b["updates"], b["env_steps"], len(b["curve"]))
-    row, = common.read_csv(tmp_path / "cut/results/policies.csv")
-    assert row["experiment"] == "ant_semi" and int(row["updates"]) == a["updates"]
-    assert (tmp_path / "cut/figures/fig05_skills_wedis.png").stat().st_size > 10_000
-
-
-def test_a_nan_in_training_is_named_and_nothing_is_overwritten(tmp_path):
-    flags = ["--out", tmp_path, "--updates", 80, "--checkpoint", 0, "--warm_up", 1000, "--replay", 5000, "--hidden", 32]
-    done = cli("03_train_policy", *flags, "--learning_rate", 1e30)
-    assert done.returncode == 1 and "losses" in done.stderr and "--resume true" in done.stderr and done.stderr.count("\n") == 1, done.stderr
-    assert not (tmp_path / "runs/policy_ant_semi_seed0.pt").exists()
+def test_three_stages_from_the_command_line(tmp_path):
+    """01 -> 02 -> 03 in a new folder; 03 prints and writes what the README says it does."""
+    assert cli("01_make_dataset", "--out", tmp_path, "--trajectories", 3000).returncode == 0
+    done = cli("02_train_wetvae", "--out", tmp_path, "--batch", 500, "--held_out", 500, "--epochs", 2)
+    assert done.returncode == 0 and done.stdout.count("purity") == 2 * 4, done.stdout + done.stderr  # two headings, two times three axes
+    assert len(common.read_csv(tmp_path / "results/wetvae.csv")) == 6 and len(common.read_csv(tmp_path / "results/crosstalk.csv")) == 18
+    done = cli("03_train_policy", "--out", tmp_path, "--updates", 80, "--warm_up", 1000, "--replay", 5000, "--hidden", 32, "--coverage", 5)
+    assert done.returncode == 0 and "f_dir(z_dir, z_cur) = z_dir" in done.stdout and f"using {tmp_path}" in done.stdout, done.stderr
+    row, = common.read_csv(tmp_path / "results/policies.csv")
+    assert row["experiment"] == "ant_semi" and int(row["updates"]) == 80 and float(row["tracking_error"]) > 0
+    curve = common.read_csv(tmp_path / "results/learning_curve_ant_semi_seed0.csv")
+    assert int(curve[-1]["updates"]) == 80 and f"{float(curve[-1]['tracking_error']):.3f}" == f"{float(row['tracking_error']):.3f}"
+    for name in ("fig04_latent_traversals", "fig05_skills_wedis", "learning_curve_ant_semi", "fig09_dataset"):
+        assert (tmp_path / f"figures/{name}.png").stat().st_size > 10_000

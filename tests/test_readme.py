@@ -17,7 +17,8 @@ def num(text, form):
 def tables():
     """Markdown of each table, from the CSV files alone."""
     results = {name: common.read_csv(ROOT / "results" / f"{name}.csv") for name in ("wetvae", "policies", "mazes")}
-    wetvae = ["| model | axis | \\|corr\\| | purity | decoded range over z in [-1.5, 1.5] | MIG | SAP | seed |", "|---|---|---|---|---|---|---|---|"]
+    wetvae = ["| model | axis | \\|corr\\| | purity | decoded range over z in [-1.5, 1.5] | MIG | SAP | seed |",
+              "|---|---|---|---|---|---|---|---|"]
     for r in results["wetvae"]:
         unit = "" if r["factor"] == "speed" else "°"
         wetvae.append(f"| {'trajectory VAE' if r['labels'] == 'none' else 'WET-VAE'} | {r['factor']} | {num(r['abs_corr'], '.2f')} | "
@@ -26,10 +27,10 @@ def tables():
     policies = ["| policy | seed | updates | minutes | tracking error, mean actions | sampled | direction error | speed ratio slow / middle / fast "
                 "| flips of 25 | executed purity speed / direction / curvature |", "|---|---|---|---|---|---|---|---|---|---|"]
     for r in results["policies"]:
+        ratios = " / ".join(num(r["speed_ratio_" + speed], ".2f") for speed in ("slow", "mid", "fast"))
+        purity = " / ".join(num(r["purity_" + name], ".2f") for name in ("speed", "direction", "curvature"))
         policies.append(f"| {r['experiment']} | {r['seed']} | {r['updates']} | {num(r['train_minutes'], '.0f')} | {num(r['tracking_error'], '.3f')} | "
-                        f"{num(r['tracking_error_sampled'], '.3f')} | {num(r['direction_error_deg'], '.1f')}° | {num(r['speed_ratio_slow'], '.2f')} / "
-                        f"{num(r['speed_ratio_mid'], '.2f')} / {num(r['speed_ratio_fast'], '.2f')} | {r['flips']} | {num(r['purity_speed'], '.2f')} / "
-                        f"{num(r['purity_direction'], '.2f')} / {num(r['purity_curvature'], '.2f')} |")
+                        f"{num(r['tracking_error_sampled'], '.3f')} | {num(r['direction_error_deg'], '.1f')}° | {ratios} | {r['flips']} | {purity} |")
     stage = script("04_mpc_maze")
     key = lambda r: (r["maze"], r["objective"], r["reward"], r["prediction"], r["seed"])  # noqa: E731
     ordered = sorted(results["mazes"], key=lambda r: (r["maze"], r["objective"], r["reward"], r["prediction"] == "decoder", r["seed"]))
