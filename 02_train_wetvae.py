@@ -82,7 +82,7 @@ def train(x, y, sizes, z_dim, variant, config):
     epoch, seconds, last_save, per_epoch = 0, 0.0, time.time(), len(x) // BATCH
     if resumable(OUT, "wetvae-checkpoint", variant, SEED, RESUME):
         state = load(OUT, "wetvae-checkpoint", variant, SEED)
-        check_same(state["config"], config, but="RESUME OUT THREADS CHECKPOINT BASELINE")
+        check_same(state, config, set(config) - {"RESUME", "OUT", "THREADS", "CHECKPOINT", "BASELINE"})
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
         epoch, seconds = state["epoch"], state["seconds"]
@@ -231,6 +231,7 @@ if __name__ == "__main__":
             save(OUT, "wetvae", variant, SEED, config, encoder=encoder.state_dict(), decoder=decoder.state_dict(), names=names,
                  abs_corr=abs_corr.tolist(), seconds=seconds)
         model = load(OUT, "wetvae", variant, SEED)
+        check_same(model, config, ("DATA", "LABELS", "HIDDEN"))
         encoder, decoder = Encoder(x.shape[2], sum(sizes), len(names)), load_decoder(model)
         encoder.load_state_dict(model["encoder"])
         with torch.no_grad():

@@ -223,7 +223,7 @@ def train(decoder, config):
 
     if resumable(OUT, "policy-checkpoint", EXPERIMENT, SEED, RESUME):
         state = load(OUT, "policy-checkpoint", EXPERIMENT, SEED)
-        check_same(state["config"], config, but="RESUME OUT THREADS CHECKPOINT UPDATES MINUTES")
+        check_same(state, config, set(config) - {"RESUME", "OUT", "THREADS", "CHECKPOINT", "UPDATES", "MINUTES"})
         networks.load_state_dict(state["networks"])
         target.load_state_dict(state["target"])
         optimizer.load_state_dict(state["optimizer"])
@@ -278,6 +278,7 @@ def train(decoder, config):
             robots.reset(over, rng)
             age[over] = 0
         if env_steps < WARM_UP:
+            seconds += time.time() - clock
             continue
         if not updates:  # state statistics of the random steps, kept from here on
             first = replay[:env_steps, :s_dim]
@@ -326,10 +327,7 @@ if __name__ == "__main__":
     if TRAIN:
         if not BATCH <= WARM_UP <= REPLAY or not UPDATES:
             stop(f"--updates must be at least 1 and --warm_up {WARM_UP} must lie between --batch {BATCH} and --replay {REPLAY}")
-        try:
-            trained = train(decoder, config)
-        except KeyboardInterrupt:
-            stop("stopped by hand; go on from the last checkpoint with --resume true", code=1)
+        trained = train(decoder, config)
         save(OUT, "policy", EXPERIMENT, SEED, config, decoder=decoder_content["decoder"], relation_weight=weight, **trained)
     policy = load(OUT, "policy", EXPERIMENT, SEED)
     actor = load_actor(policy)

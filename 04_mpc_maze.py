@@ -205,18 +205,18 @@ def animate(maze, poses, every=6):
             frames.append(top_view(maze, model, data, poses[:i + 1]))
             continue
         views = []
-        for lookat, distance, elevation in (((12.5, 5, 0), 32, -65), ((*poses[i, :2], 0.5), 5, -35)):
+        for lookat, distance, elevation in (((12.5, 5.5, 0), 35, -70), ((*poses[i, :2], 0.5), 5, -35)):
             camera = mujoco.MjvCamera()
             camera.lookat, camera.distance, camera.azimuth, camera.elevation = lookat, distance, 90, elevation
             renderer.update_scene(data, camera)
             for x, y in poses[:i + 1:10, :2]:  # the trail
-                mujoco.mjv_initGeom(renderer.scene.geoms[renderer.scene.ngeom], mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.12),
+                mujoco.mjv_initGeom(renderer.scene.geoms[renderer.scene.ngeom], mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.2),
                                     np.array([x, y, 0.15]), np.eye(3).ravel(), np.array([0.84, 0.37, 0, 1], np.float32))
                 renderer.scene.ngeom += 1
             views.append(renderer.render().copy())
         frames.append(Image.fromarray(np.concatenate(views, 1)))
     path = Path(OUT) / "figures" / f"{maze}.gif"
-    frames = [frame.quantize(64, dither=Image.Dither.NONE) for frame in frames]
+    frames = [frame.quantize(64, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE) for frame in frames]
     write_whole(path, lambda file: frames[0].save(file, "GIF", save_all=True, append_images=frames[1:] + [frames[-1]] * 10,
                                                   duration=60, loop=0, optimize=True))
     print(f"wrote figures/{path.name}, {how}")

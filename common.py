@@ -14,6 +14,7 @@ import io
 import json
 import math
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -49,6 +50,11 @@ def parse_flags(stage, argv=None):
     stage: the script's globals(). A row of its EXPERIMENTS table overrides constants by name, flags override both.
     Returns the configuration {NAME: value}. Exits with 2 and one line on an unknown flag, experiment or wrong type.
     """
+    if argv is None:  # a real command line: Ctrl-C and SIGTERM end with one line too
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        sys.excepthook = lambda kind, error, trace: (
+            print("\nstopped by hand; what was saved stays, and training goes on from its last checkpoint with --resume true", file=sys.stderr)
+            if kind is KeyboardInterrupt else sys.__excepthook__(kind, error, trace))
     lines = Path(stage["__file__"]).read_text().splitlines()
     comments = {}
     for node in ast.parse("\n".join(lines)).body:
@@ -121,6 +127,8 @@ def write_whole(path, write):
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(partial, "wb") as file:
             write(file)
+            file.flush()
+            os.fsync(file.fileno())  # on the disk before it takes the name: a power cut leaves no empty artifact
         os.replace(partial, path)  # atomic
     except OSError as error:
         with contextlib.suppress(OSError):
@@ -178,11 +186,12 @@ def resumable(out, kind, experiment, seed, resume):
     return resume and found
 
 
-def check_same(old, new, but):
-    """Exit with 2 unless a checkpoint's configuration is today's; `but` names the flags that may differ."""
-    for name in sorted(set(new) - set(but.split())):
-        if old.get(name) != new[name]:
-            stop(f"the checkpoint was made with --{name.lower()} {old.get(name)}, not {new[name]}; resume with the same, or without --resume")
+def check_same(artifact, config, names):
+    """Exit with 2 unless the artifact was made with today's value of each constant in names."""
+    for name in sorted(names):
+        if (old := artifact["config"].get(name)) != config[name]:
+            stop(f"{artifact_name(*(artifact[key] for key in ('kind', 'experiment', 'seed')))} was made with --{name.lower()} {old}, "
+                 f"not {config[name]}; give the same, or train anew")
 
 
 def update_csv(path, rows, key):
@@ -262,8 +271,9 @@ class Decoder(nn.Module):
 
 
 def load_decoder(content):
-    decoder = Decoder(content["decoder"]["axes"].shape[0])
-    decoder.load_state_dict(content["decoder"])
+    state = content["decoder"]
+    decoder = Decoder(len(state["axes"]), len(state["head.2.bias"]) // 2, len(state["head.0.bias"]))
+    decoder.load_state_dict(state)
     return decoder.requires_grad_(False)
 
 
@@ -313,8 +323,12 @@ def ant_spec():
     capsule = dict(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.08, 0, 0])
 
     world = spec.worldbody
-    world.add_light(pos=[0, 0, 1.3], dir=[0, 0, -1.3], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, diffuse=[1, 1, 1])
-    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[40, 40, 40], conaffinity=1, rgba=[0.8, 0.9, 0.8, 1])
+    world.add_light(pos=[0, 0, 1.3], dir=[0.2, 0.2, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, diffuse=[0.8, 0.8, 0.8])
+    spec.visual.headlight.diffuse = [0.3, 0.3, 0.3]
+    spec.add_texture(name="tiles", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER, width=64, height=64,
+                     rgb1=[0.86, 0.89, 0.86], rgb2=[0.78, 0.82, 0.79])
+    spec.add_material(name="tiles", texrepeat=[0.5, 0.5], texuniform=True).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
+    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[40, 40, 40], conaffinity=1, material="tiles", rgba=[1, 1, 1, 1])
     torso = world.add_body(name="torso", pos=[0, 0, 0.75])
     torso.add_freejoint(name="root").margin = 0.01
     torso.add_geom(name="torso_geom", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.25, 0, 0])

@@ -29,8 +29,10 @@ def tables():
     for r in results["policies"]:
         ratios = " / ".join(num(r["speed_ratio_" + speed], ".2f") for speed in ("slow", "mid", "fast"))
         purity = " / ".join(num(r["purity_" + name], ".2f") for name in ("speed", "direction", "curvature"))
-        policies.append(f"| {r['experiment']} | {r['seed']} | {r['updates']} | {num(r['train_minutes'], '.0f')} | {num(r['tracking_error'], '.3f')} | "
-                        f"{num(r['tracking_error_sampled'], '.3f')} | {num(r['direction_error_deg'], '.1f')}° | {ratios} | {r['flips']} | {purity} |")
+        policies.append(f"| {r['experiment']} | {r['seed']} | {r['updates']} | {num(r['train_minutes'], '.0f')} | "
+                        f"{num(r['tracking_error'], '.3f')} | "
+                        f"{num(r['tracking_error_sampled'], '.3f')} | {num(r['direction_error_deg'], '.1f')}° | "
+                        f"{ratios} | {r['flips']} | {purity} |")
     stage = script("04_mpc_maze")
     key = lambda r: (r["maze"], r["objective"], r["reward"], r["prediction"], r["seed"])  # noqa: E731
     ordered = sorted(results["mazes"], key=lambda r: (r["maze"], r["objective"], r["reward"], r["prediction"] == "decoder", r["seed"]))

@@ -194,7 +194,27 @@ def test_a_file_where_a_folder_is_needed(tmp_path):
 
 def test_a_checkpoint_of_other_flags_is_refused(made):
     done = cli(S3, "--out", made, *TINY_POLICY, "--hidden", 48, "--resume", "true")
-    assert done.returncode == 2 and "the checkpoint was made with --hidden 32, not 48" in done.stderr and done.stderr.count("\n") == 1
+    assert done.returncode == 2 and "policy-checkpoint_ant_semi_seed0.pt was made with --hidden 32, not 48" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_and_sigterm_end_with_one_line(number, made, tmp_path):
+    (tmp_path / "runs").mkdir()
+    shutil.copy(made / "runs/dataset_main_seed0.npz", tmp_path / "runs")
+    process = subprocess.Popen([sys.executable, "-u", str(ROOT / f"{S2}.py"), "--out", str(tmp_path), *map(str, TINY_VAE), "--epochs", "2000"],
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while not process.stdout.readline().startswith("epoch"):
+        pass
+    process.send_signal(number)
+    error = process.communicate()[1]
+    assert process.returncode != 0 and error.strip().count("\n") == 0 and "stopped by hand" in error and "--resume true" in error, error
+
+
+def test_an_artifact_of_other_labels_is_refused(made):
+    done = cli(S2, "--out", made, *TINY_VAE, "--train", "false", "--labels", "speed")
+    assert done.returncode == 2 and "was made with --labels speed direction curvature, not speed" in done.stderr, done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def test_an_artifact_of_another_experiment_is_refused(made, tmp_path):
