@@ -55,7 +55,7 @@ def draw_fig09(trajectories, factors):
             path = make_trajectories(np.ones(1), np.zeros(1), np.radians([degrees]), LENGTH)[0]
             fan.plot(*path.T, "o-", ms=3, color=colours[label], label=names[label] if k == 0 else None)
     fan.set(title="label curvature (10, 20, 30° per transition)", xlabel="x", ylabel="y", aspect="equal")
-    fan.legend(loc="center left")
+    fan.legend(loc="upper left")
     labels = weak_labels(factors, ["curvature"])[:, 0]
     for path, label in list(zip(trajectories, labels))[:300]:
         data.plot(*path.T, color=colours[label], lw=0.6, alpha=0.7)

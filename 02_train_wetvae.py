@@ -16,8 +16,8 @@ from torch import nn
 from torch.nn import functional as F
 
 import common
-from common import (LABEL_RULES, Decoder, artifact_name, check_same, cross_talk, factors_of, gaussian_log_prob, load, load_decoder,
-                    parse_flags, plt, resumable, save, save_figure, stop, update_csv, weak_labels)
+from common import (LABEL_RULES, Decoder, artifact_name, bootstrap_interval, check_same, cross_talk, factors_of, gaussian_log_prob,
+                    load, load_decoder, parse_flags, plt, read_csv, resumable, save, save_figure, stop, update_csv, weak_labels)
 
 EXPERIMENT = "main"    # row of EXPERIMENTS below
 SEED = 0               # random seed
@@ -42,6 +42,7 @@ THREADS = 2            # CPU threads
 
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
     "main": {},
+    "seeds": {},  # the same; each --seed adds its rows to results/wetvae.csv and its points to the figure of all seeds
 }
 
 
@@ -201,6 +202,26 @@ def draw_fig04(decoders, names):
     save_figure(figure, OUT, "fig04_latent_traversals" + ("" if EXPERIMENT == "main" else f"_{EXPERIMENT}"))
 
 
+def draw_seeds():
+    """Purity and |corr| of every seed trained so far, of both models: each seed a point, the mean with its 95 % bootstrap interval."""
+    rows = [row for row in read_csv(Path(OUT) / "results" / "wetvae.csv") if row["experiment"] == EXPERIMENT]
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True)
+    for ax, measure in zip(axes, ("purity", "abs_corr")):
+        for labels, name, colour, shift in ((EXPERIMENT, "WET-VAE", common.BLUE, -0.15), ("none", "trajectory VAE", common.RED, 0.15)):
+            for i, factor in enumerate(LABELS.split()):
+                v = np.array([float(row[measure]) for row in rows if row["labels"] == labels and row["factor"] == factor])
+                if len(v):
+                    low, high = bootstrap_interval(v)
+                    spread = np.linspace(-0.08, 0.08, len(v))
+                    ax.plot(i + shift + spread, v, ".", color=colour, alpha=0.6, label=f"{name}, {len(v)} seeds" if i == 0 else None)
+                    ax.errorbar(i + shift, v.mean(), [[v.mean() - low], [high - v.mean()]], color="black", fmt="_", ms=14, capsize=3)
+                    print(f"{name:15s} {measure:9s} z_{factor:10s} mean {v.mean():.3f} [{low:.3f}, {high:.3f}], worst {v.min():.3f}, n = {len(v)}")
+        ax.set(xticks=range(len(LABELS.split())), xticklabels=[f"z_{f}" for f in LABELS.split()], ylim=(0, 1.02),
+               ylabel={"purity": "purity of the axis", "abs_corr": "|corr| with its factor"}[measure])
+    axes[0].legend(loc="lower left")
+    save_figure(figure, OUT, "seeds_wetvae")
+
+
 if __name__ == "__main__":
     config = parse_flags(globals())
     if unknown := set(LABELS.split()) - set(LABEL_RULES):
@@ -238,4 +259,7 @@ if __name__ == "__main__":
             mean, _ = encoder(x[test], one_hot_labels(y[test], sizes))
         measure(variant, decoder, model["abs_corr"], (mean @ decoder.axes.T).numpy(), factors[test], names, model["seconds"])
         decoders.append(decoder)
-    draw_fig04(decoders, names)
+    if EXPERIMENT == "seeds":
+        draw_seeds()
+    else:
+        draw_fig04(decoders, names)

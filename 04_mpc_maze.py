@@ -7,8 +7,8 @@ import time
 from pathlib import Path
 
 import common  # before mujoco: it chooses how mujoco renders
-from common import (STEP_SCALE, Robots, ant_spec, execute, load, load_actor, load_decoder, parse_flags, plt, predict, save_figure,
-                    stop, update_csv, write_whole)
+from common import (STEP_SCALE, Robots, ant_spec, bootstrap_interval, execute, load, load_actor, load_decoder, parse_flags, plt,
+                    predict, save_figure, stop, update_csv, write_whole)
 import mujoco
 import numpy as np
 import torch
@@ -137,8 +137,7 @@ def run(actor, decoder, weight, maze, reward, prediction, objective):
 def summary(rows):
     """One line of the table, from CSV rows of one configuration: mean final distance with its 95 % bootstrap interval."""
     d = np.array([float(row["final_distance"]) for row in rows])
-    means = np.random.default_rng(0).choice(d, (10_000, len(d))).mean(1)
-    low, high = np.quantile(means, [0.025, 0.975])
+    low, high = bootstrap_interval(d)
     success = 100 * np.mean([int(row["success"]) for row in rows])
     contacts = np.mean([int(row["contacts"]) for row in rows])
     first = rows[0]

@@ -28,6 +28,11 @@ import torch
 from mujoco.batch import Batch
 from torch import nn
 
+try:
+    import fcntl
+except ImportError:
+    fcntl = None
+
 matplotlib.use("Agg")  # figures are files; no window is ever opened
 import matplotlib.pyplot as plt  # noqa: E402
 
@@ -194,21 +199,38 @@ def check_same(artifact, config, names):
                  f"not {config[name]}; give the same, or train anew")
 
 
+@contextlib.contextmanager
+def locked(path):
+    """One process at a time: seeds trained side by side write rows into one file."""
+    with open(path.with_name(path.name + ".lock"), "w") as file:
+        if fcntl:  # not on Windows: let only one process write there
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
 def update_csv(path, rows, key):
     """Write rows (dicts), replacing those in the file that agree with one of them on the columns in key."""
-    old = read_csv(path) if path.exists() else []
     new = [{k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in row.items()} for row in rows]
     ours = {tuple(row[k] for k in key) for row in new}
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(new[0]), extrasaction="ignore", restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows([row for row in old if tuple(row.get(k) for k in key) not in ours] + new)
-    write_whole(path, lambda file: file.write(text.getvalue().encode()))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with locked(path):
+        old = read_csv(path) if path.exists() else []
+        text = io.StringIO()
+        writer = csv.DictWriter(text, list(new[0]), extrasaction="ignore", restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows([row for row in old if tuple(row.get(k) for k in key) not in ours] + new)
+        write_whole(path, lambda file: file.write(text.getvalue().encode()))
 
 
 def read_csv(path):
     with open(path, newline="") as file:
         return list(csv.DictReader(file))
+
+
+def bootstrap_interval(values, draws=10_000):
+    """95 % bootstrap interval of the mean of values (n,): (low, high)."""
+    means = np.random.default_rng(0).choice(values, (draws, len(values))).mean(1)
+    return np.quantile(means, [0.025, 0.975])
 
 
 # ---------------------------------------------------------------- weak labels and factors

@@ -146,7 +146,7 @@ RUBBISH = [  # script, flags, exit code, the line without the script's name; OUT
     (S1, "--experiment nope", 2, "unknown experiment 'nope'; allowed: main"),
     (S1, "--trajectories 0", 2, "--trajectories and --length must be at least 1, --straight at most 1, --speed_low at most --speed_high"),
     (S1, "--straight 1.5", 2, "--trajectories and --length must be at least 1, --straight at most 1, --speed_low at most --speed_high"),
-    (S2, "--experiment Main", 2, "unknown experiment 'Main'; allowed: main"),
+    (S2, "--experiment Main", 2, "unknown experiment 'Main'; allowed: main seeds"),
     (S2, "--train maybe", 2, "argument --train: invalid true or false value: 'maybe'; see --help"),
     (S2, "--labels colour", 2, "no weak label 'colour'; allowed: speed direction curvature"),
     (S2, "", 2, "no dataset_main_seed0.npz in runs/ or pretrained/; make it with: python 01_make_dataset.py --experiment main --seed 0"),
