@@ -22,7 +22,7 @@ OUT = "."                # folder for runs/, figures/ and results/
 TRAIN = True             # false: only measure and draw what is already trained
 RESUME = False           # true: continue from the last checkpoint
 THREADS = 2              # CPU threads
-UPDATES = 200_000        # SAC updates; the schedules below run over them (the paper: 1.92 million)
+UPDATES = 180_000        # SAC updates; the schedules below run over them (the paper: 1.92 million)
 MINUTES = 0.0            # if not 0, the schedules run out with this clock instead, whatever UPDATES says
 CHECKPOINT = 5.0         # minutes between checkpoints
 
@@ -44,11 +44,12 @@ HIDDEN = 256             # width of the two hidden layers (the paper: 512)
 LEARNING_RATE = 1e-3     # Adam, decays linearly to 0 over the second half (the paper: 3e-4, fixed)
 DISCOUNT = 0.97          # gamma of Eq. 1 (the paper: 0.99)
 SMOOTHING = 0.01         # of the target value network, App. A.1.3
-TEMPERATURE = 0.01       # alpha, weight of the entropy, App. A.1.3
 REWARD_SCALE = 0.1       # the paper: 1
+TEMPERATURE = 0.01       # alpha, weight of the entropy, while a walk is sought
+TEMPERATURE_END = 0.001  # later: the paper's 0.01 (App. A.1.3) times REWARD_SCALE
 VARIANCE_SCALE = 0.05    # decoder variance -> square metres, App. A.1.3: 1/20
 FLOOR_START = 0.04       # metres, least standard deviation of the reward: a sharp one makes standing still a trap
-FLOOR_END = 0.01         # shrinks to this between half and nine tenths of the updates: teaches the slow skills
+FLOOR_END = 0.01         # floor and temperature shrink between 0.3 and 0.7 of the updates: teaches the slow skills
 
 COVERAGE = 200           # random skills whose visited cells of 1 m are counted at the end
 
@@ -89,7 +90,7 @@ def reward(decoder, z, displacement, floor):
     return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * mean[:, 0]) ** 2 / variance).sum(1)
 
 
-def sac_losses(actor, critics, value, target, x, a, x2, r):
+def sac_losses(actor, critics, value, target, x, a, x2, r, temperature):
     """Losses of the actor, the twin critics and the value network (Haarnoja et al. 2018). x, x2 (B, n): state and skill
     before and after the step; a (B, m); r (B,). Every step is followed by another: time limits are not terminal."""
     with torch.no_grad():
@@ -100,8 +101,8 @@ def sac_losses(actor, critics, value, target, x, a, x2, r):
     q_new = critics(x, a_leaf).min(0).values
     # the trap: a plain backward through q_new would also train the critics to please the actor, and cost another pass
     slope, = torch.autograd.grad(q_new.sum(), a_leaf)
-    actor_loss = (TEMPERATURE * log_prob - (slope * a_new).sum(1)).mean()
-    v_loss = 0.5 * ((value(x).squeeze(1) - (q_new - TEMPERATURE * log_prob).detach()) ** 2).mean()
+    actor_loss = (temperature * log_prob - (slope * a_new).sum(1)).mean()
+    v_loss = 0.5 * ((value(x).squeeze(1) - (q_new - temperature * log_prob).detach()) ** 2).mean()
     return actor_loss, q_loss, v_loss
 
 
@@ -287,7 +288,9 @@ def train(decoder, config):
         # Improve: a few updates
         for _ in range(UPDATES_PER_STEP):
             progress = share_done()
-            floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** min(1, max(0, (progress - 0.5) / 0.4))
+            late = min(1, max(0, (progress - 0.3) / 0.4))
+            floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** late
+            temperature = TEMPERATURE * (TEMPERATURE_END / TEMPERATURE) ** late
             for group in optimizer.param_groups:
                 group["lr"] = LEARNING_RATE * min(1, max(0, 2 * (1 - progress)))
             batch = replay[torch.randint(min(env_steps, REPLAY), (BATCH,))]
@@ -295,7 +298,7 @@ def train(decoder, config):
             skill[:int(RELABELLED * BATCH)] = torch.randn(int(RELABELLED * BATCH), z_dim)  # a copy: replay keeps its own
             with torch.no_grad():
                 r = reward(decoder, skill, displacement, floor)
-            losses = sac_losses(actor, critics, value, target, actor.inputs(s, skill), a, actor.inputs(s2, skill), r)
+            losses = sac_losses(actor, critics, value, target, actor.inputs(s, skill), a, actor.inputs(s2, skill), r, temperature)
             optimizer.zero_grad()
             sum(losses).backward()  # the three touch disjoint parameters
             optimizer.step()
