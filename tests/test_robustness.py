@@ -11,8 +11,8 @@ import pytest
 import torch
 from conftest import ROOT, cli
 
-TINY_VAE = ["--batch", 200, "--held_out", 500, "--epochs", 12, "--checkpoint", 0, "--baseline", "false", "--threads", 1]
-TINY_POLICY = ["--updates", 400, "--warm_up", 500, "--replay", 2000, "--hidden", 32, "--coverage", 5, "--checkpoint", 0, "--threads", 1]
+TINY_VAE = ["--batch", 200, "--held_out", 500, "--epochs", 60, "--checkpoint", 0, "--baseline", "false", "--threads", 1]
+TINY_POLICY = ["--updates", 160, "--warm_up", 500, "--replay", 2000, "--hidden", 32, "--coverage", 5, "--reports", 10, "--checkpoint", 0, "--threads", 1]
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def test_training_killed_five_times_ends_with_the_same_bits(name, kind, experime
         process.communicate()
         state = common.load(tmp_path, f"{kind}-checkpoint", experiment, 0)  # whole, whatever the moment
         resumed_at.append(state["epoch"] if kind == "wetvae" else state["updates"])
-    assert sorted(resumed_at) == resumed_at and resumed_at[0] < resumed_at[-1] < (12 if kind == "wetvae" else 400)
+    assert sorted(resumed_at) == resumed_at and resumed_at[0] < resumed_at[-1] < (60 if kind == "wetvae" else 160)
     done = cli(name, "--out", tmp_path, "--resume", "true", *flags)
     assert done.returncode == 0 and checkpoint.exists(), done.stderr
     whole, cut = (common.load(out, kind, experiment, 0) for out in (made, tmp_path))
@@ -58,14 +58,13 @@ def test_training_killed_five_times_ends_with_the_same_bits(name, kind, experime
     assert clean(whole.get("curve", [])) == clean(cut.get("curve", []))
 
 
-def test_same_seed_same_bits_and_two_seeds_differ(made, tmp_path):
+def test_two_seeds_differ(made, tmp_path):
+    """That the same seed gives the same bits is what the five kills show; another seed gives others."""
     (tmp_path / "runs").mkdir()
     shutil.copy(made / "runs/dataset_main_seed0.npz", tmp_path / "runs")
-    for seed in (0, 1):
-        assert cli("02_train_wetvae", "--out", tmp_path, *TINY_VAE, "--seed", seed).returncode == 0
-    first, same, other = (common.load(out, "wetvae", "main", seed)["decoder"] for out, seed in ((made, 0), (tmp_path, 0), (tmp_path, 1)))
-    assert all(torch.equal(first[k], same[k]) for k in first)
-    assert not torch.equal(first["cell.weight_ih"], other["cell.weight_ih"])
+    assert cli("02_train_wetvae", "--out", tmp_path, *TINY_VAE, "--epochs", 1, "--seed", 1).returncode == 0
+    one, other = (common.load(out, "wetvae", "main", seed)["decoder"] for out, seed in ((made, 0), (tmp_path, 1)))
+    assert not torch.equal(one["cell.weight_ih"], other["cell.weight_ih"])
 
 
 # ---------------------------------------------------------------- damage
