@@ -23,7 +23,8 @@ OUT = "."                # folder for runs/, figures/ and results/
 TRAIN = True             # false: only measure and draw what is already trained
 RESUME = False           # true: continue from the last checkpoint
 THREADS = 2              # CPU threads
-UPDATES = 150_000        # SAC updates; the schedules below run over them (the paper: 1.92 million)
+UPDATES = 200_000        # SAC updates; the schedules below run over them (the paper: 1.92 million)
+POLISH = 12_000          # further updates at TEMPERATURE_END
 MINUTES = 0.0            # if not 0, the schedules run out with this clock instead, whatever UPDATES says
 CHECKPOINT = 5.0         # minutes between checkpoints, which are made after a report
 REPORTS = 40             # printed lines and points of the learning curve
@@ -47,11 +48,11 @@ LEARNING_RATE = 1e-3     # Adam, decays linearly to 0 over the second half (the 
 DISCOUNT = 0.97          # gamma of Eq. 1 (the paper: 0.99)
 SMOOTHING = 0.01         # of the target value network, App. A.1.3
 REWARD_SCALE = 0.1       # the paper: 1
-TEMPERATURE = 0.01       # alpha, weight of the entropy, while a walk is sought
-TEMPERATURE_END = 0.001  # later: the paper's 0.01 (App. A.1.3) times REWARD_SCALE
+TEMPERATURE = 0.01       # alpha, weight of the entropy, App. A.1.3
+TEMPERATURE_END = 0.001  # while polishing: the paper's 0.01 times REWARD_SCALE; the mean action nears what the policy does
 VARIANCE_SCALE = 0.05    # decoder variance -> square metres, App. A.1.3: 1/20
 FLOOR_START = 0.04       # metres, least standard deviation of the reward: a sharp one makes standing still a trap
-FLOOR_END = 0.01         # floor and temperature shrink between 0.3 and 0.7 of the updates: teaches the slow skills
+FLOOR_END = 0.01         # shrinks to this between half and nine tenths of the updates: teaches the slow skills
 
 COVERAGE = 200           # random skills whose visited cells of 1 m are counted at the end
 
@@ -226,7 +227,7 @@ def train(decoder, config):
 
     if resumable(OUT, "policy-checkpoint", EXPERIMENT, SEED, RESUME):
         state = load(OUT, "policy-checkpoint", EXPERIMENT, SEED)
-        check_same(state, config, set(config) - {"RESUME", "OUT", "THREADS", "CHECKPOINT", "UPDATES", "MINUTES"})
+        check_same(state, config, set(config) - {"RESUME", "OUT", "THREADS", "CHECKPOINT", "REPORTS", "UPDATES", "POLISH", "MINUTES"})
         networks.load_state_dict(state["networks"])
         target.load_state_dict(state["target"])
         optimizer.load_state_dict(state["optimizer"])
@@ -256,7 +257,7 @@ def train(decoder, config):
               f"{updates / seconds:4.0f} updates/s  {seconds / 60 * (1 / progress - 1):4.0f} min left", flush=True)
 
     def share_done():
-        return seconds / 60 / MINUTES if MINUTES else updates / UPDATES
+        return seconds / 60 / MINUTES if MINUTES else updates / (UPDATES + POLISH)
 
     progress, last_save, interval = share_done(), time.time(), max(1, UPDATES // REPORTS)
     while progress < 1:
@@ -290,11 +291,11 @@ def train(decoder, config):
         # Improve: a few updates
         for _ in range(UPDATES_PER_STEP):
             progress = share_done()
-            late = min(1, max(0, (progress - 0.3) / 0.4))
-            floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** late
-            temperature = TEMPERATURE * (TEMPERATURE_END / TEMPERATURE) ** late
+            main = progress * (UPDATES + POLISH) / UPDATES
+            rate, temperature = (min(1, 2 * (1 - main)), TEMPERATURE) if main < 1 else (2 * (1 - progress), TEMPERATURE_END)
+            floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** min(1, max(0, (main - 0.5) / 0.4))
             for group in optimizer.param_groups:
-                group["lr"] = LEARNING_RATE * min(1, max(0, 2 * (1 - progress)))
+                group["lr"] = LEARNING_RATE * max(0, rate)
             batch = replay[torch.randint(min(env_steps, REPLAY), (BATCH,))]
             s, a, s2, displacement, skill = batch.split(columns, 1)
             skill[:int(RELABELLED * BATCH)] = torch.randn(int(RELABELLED * BATCH), z_dim)  # a copy: replay keeps its own

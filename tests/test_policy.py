@@ -156,7 +156,8 @@ def test_three_stages_from_the_command_line(tmp_path):
     done = cli("02_train_wetvae", "--out", tmp_path, "--batch", 500, "--held_out", 500, "--epochs", 2)
     assert done.returncode == 0 and done.stdout.count("purity") == 2 * 4, done.stdout + done.stderr  # two headings, two times three axes
     assert len(common.read_csv(tmp_path / "results/wetvae.csv")) == 6 and len(common.read_csv(tmp_path / "results/crosstalk.csv")) == 18
-    done = cli("03_train_policy", "--out", tmp_path, "--updates", 80, "--reports", 2, "--warm_up", 1000, "--replay", 5000, "--hidden", 32, "--coverage", 5)
+    done = cli("03_train_policy", "--out", tmp_path, "--updates", 40, "--polish", 40, "--reports", 2, "--warm_up", 1000, "--replay", 5000,
+               "--hidden", 32, "--coverage", 5)
     assert done.returncode == 0 and "f_dir(z_dir, z_cur) = z_dir" in done.stdout and f"using {tmp_path}" in done.stdout, done.stderr
     row, = common.read_csv(tmp_path / "results/policies.csv")
     assert row["experiment"] == "ant_semi" and int(row["updates"]) == 80 and float(row["tracking_error"]) > 0
