@@ -3,7 +3,8 @@
 Reads runs/wetvae_*.pt. The reward is the decoder's log-likelihood of the step just made (Eq. 6), computed when a batch is
 sampled, so that any stored step can be relabelled with a fresh skill. Writes runs/policy_<experiment>_seed<seed>.pt,
 Fig 5, the learning curve (figures/, results/) and a row of results/policies.csv.
-Takes @T3@ on two cores (AMD EPYC 7003, no AVX-512). @EXPECT3@
+Takes 56 minutes on two cores that do nothing else (63 updates/s; AMD EPYC 7003, no AVX-512). Expect, n = 1 (seed 0): tracking error 0.22 with
+mean and 0.18 with sampled actions, direction error 3.8 degrees, middle and fast skills at 0.9 of their speed, slow ones at 0.3.
 """
 import math
 import time
