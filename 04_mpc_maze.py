@@ -2,7 +2,7 @@
 
 Reads runs/policy_*.pt (or the one in pretrained/). Plans with random shooting over skills, executes on the MuJoCo Ant between
 walls of real geoms, prints one table and writes results/mazes.csv, Fig 6 (mazes), Fig 8 (examples) and a GIF per maze.
-Takes 2.6 minutes on two cores (AMD EPYC 7003).
+Takes 2.5 minutes on two cores (AMD EPYC 7003).
 """
 import time
 from pathlib import Path
