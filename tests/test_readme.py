@@ -1,4 +1,4 @@
-"""The README's tables are made from results/*.csv. `python tests/test_readme.py` writes them; the tests hold them together."""
+"""The README's tables are made from results/*.csv. `PYTHONPATH=. python tests/test_readme.py` writes them; the tests hold them together."""
 import re
 from itertools import groupby
 
