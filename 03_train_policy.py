@@ -309,6 +309,7 @@ def train(decoder, config):
             torch._foreach_lerp_(list(target.parameters()), list(value.parameters()), SMOOTHING)
             updates += 1
         seconds += time.time() - clock
+        progress = share_done()
 
         if updates // interval > before // interval or progress >= 1:
             for name, metric in zip(("actor loss", "critic loss", "value loss", "reward"), (*losses, r.mean())):

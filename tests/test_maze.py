@@ -39,11 +39,11 @@ def test_walls_stop_the_ant_and_the_sensor_feels_it(s4):
     robots.qpos[1, 0] = -20
     felt = np.zeros(2, bool)
     for _ in range(60):
-        robots.qvel[:, 0] = 2  # pushed along x
+        robots.qvel[:, 0] = 1  # pushed along x, no faster than it walks
         robots.step(np.zeros((2, 8)))
         felt |= touch[:, 0] > 0
     assert felt.tolist() == [True, False]
-    assert robots.qpos[0, 0] < 1.2 and robots.qpos[1, 0] > -20 + 3
+    assert robots.qpos[0, 0] < 1.2 and robots.qpos[1, 0] > -20 + 2
 
 
 def test_scaled_path_is_algorithm_2_line_by_line(s4):
