@@ -311,11 +311,11 @@ def train(decoder, config):
         seconds += time.time() - clock
         progress = share_done()
 
+        for name, metric in zip(("actor loss", "critic loss", "value loss", "reward"), (*losses, r.mean())):
+            if not math.isfinite(metric.item()):
+                stop(f"{name} is {metric.item()} after {updates} updates; nothing was overwritten: go on from the last good "
+                     f"{artifact_name('policy-checkpoint', EXPERIMENT, SEED)} with --resume true, or lower --learning_rate", code=1)
         if updates // interval > before // interval or progress >= 1:
-            for name, metric in zip(("actor loss", "critic loss", "value loss", "reward"), (*losses, r.mean())):
-                if not math.isfinite(metric.item()):
-                    stop(f"{name} is {metric.item()} after {updates} updates; nothing was overwritten: go on from the last good "
-                         f"{artifact_name('policy-checkpoint', EXPERIMENT, SEED)} with --resume true, or lower --learning_rate", code=1)
             report()
             if time.time() - last_save > 60 * CHECKPOINT:
                 checkpoint()
