@@ -203,11 +203,12 @@ def test_ctrl_c_and_sigterm_end_with_one_line(number, made, tmp_path):
     (tmp_path / "runs").mkdir()
     shutil.copy(made / "runs/dataset_main_seed0.npz", tmp_path / "runs")
     process = subprocess.Popen([sys.executable, "-u", str(ROOT / f"{S2}.py"), "--out", str(tmp_path), *map(str, TINY_VAE), "--epochs", "2000"],
-                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    while not process.stdout.readline().startswith("epoch"):
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                               preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))  # a background job ignores Ctrl-C
+    while not process.stdout.readline().startswith("epoch") and process.poll() is None:
         pass
     process.send_signal(number)
-    error = process.communicate()[1]
+    error = process.communicate(timeout=60)[1]
     assert process.returncode != 0 and error.strip().count("\n") == 0 and "stopped by hand" in error and "--resume true" in error, error
 
 
