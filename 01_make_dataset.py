@@ -1,8 +1,8 @@
 """Stage 1: factors -> trajectories (App. A.1.1, Table 1, Fig 9).
 
-Draws factors (speed, direction, curvature), turns each draw into a trajectory of T transitions from the origin, and
-writes runs/dataset_<experiment>_seed<seed>.npz: trajectories (N, T + 1, 2), factors (N, M), names (M,).
-No robot is involved: the trajectories are what we want a robot to be able to do. Takes 3 s.
+Draws factors (speed, direction, curvature; in other experiments acceleration), turns each draw into a trajectory of T transitions
+from the origin, and writes runs/dataset_<experiment>_seed<seed>.npz: trajectories (N, T + 1, 2 or 1), factors (N, M), names (M,),
+ranges (M,). No robot is involved: the trajectories are what we want a robot to be able to do. Takes 6 s.
 """
 import math
 
@@ -17,22 +17,33 @@ OUT = "."               # folder for runs/ and figures/
 
 TRAJECTORIES = 100_000  # N, App. A.1.1
 LENGTH = 5              # T, transitions per trajectory
+FACTORS = "speed direction curvature"  # what is drawn; without direction the trajectories are one-dimensional
 SPEED_LOW = 0.0         # speed ~ U(SPEED_LOW, SPEED_HIGH), trajectory units per transition (Table 1, 2D)
 SPEED_HIGH = 1.0        # no transition is longer than 1
 DIRECTION = 90.0        # direction ~ U(-DIRECTION, DIRECTION), degrees: the right-sided semicircle
 CURVATURE = 30.0        # curvature ~ U(-CURVATURE, CURVATURE), degrees turned per transition
-STRAIGHT = 0.2          # probability that the curvature is exactly 0
+ACCELERATION = 0.2      # acceleration ~ U(-ACCELERATION, ACCELERATION) times the speed, per transition; + is speeding up
+STRAIGHT = 0.2          # probability that the curvature is exactly 0; the same for the acceleration
 
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
     "main": {},
+    "full": dict(DIRECTION=180.0),                                                        # the Ant of Fig 15
+    "polar": dict(FACTORS="speed direction", DIRECTION=180.0),                            # Fig 11: radius and angle
+    "speed_acc": dict(FACTORS="speed acceleration", SPEED_LOW=-1.0),                      # Fig 12, 16: one dimension
+    "four_factors": dict(FACTORS="speed direction curvature acceleration", DIRECTION=180.0),  # Fig 13
 }
 
 
-def make_trajectories(speed, direction, curvature, length):
-    """Factors (N,) each -> points (N, length + 1, 2): steps of `speed`, the heading turned by `curvature` at each one."""
-    heading = direction[:, None] + curvature[:, None] * np.arange(length)
-    steps = speed[:, None, None] * np.stack([np.cos(heading), np.sin(heading)], -1)
-    return np.concatenate([np.zeros((len(speed), 1, 2)), steps.cumsum(1)], 1)  # s_0 is fixed at the origin, Sec. 4.1
+def make_trajectories(speed, direction=None, curvature=0.0, acceleration=0.0, length=5):
+    """Factors (N,) each -> points (N, length + 1, 2): steps of `speed`, the heading turned by `curvature` and the step longer by
+    `acceleration` times `speed` at each one. Without direction: one dimension (N, length + 1, 1), where speed has a sign."""
+    t = np.arange(length)
+    speed = speed[:, None] * (1 + np.multiply.outer(acceleration, t))
+    steps = speed[..., None]
+    if direction is not None:
+        heading = direction[:, None] + np.multiply.outer(curvature, t)
+        steps = steps * np.stack([np.cos(heading), np.sin(heading)], -1)
+    return np.pad(steps.cumsum(1), ((0, 0), (1, 0), (0, 0)))  # s_0 is fixed at the origin, Sec. 4.1
 
 
 def draw_fig09(trajectories, factors):
@@ -52,7 +63,7 @@ def draw_fig09(trajectories, factors):
     colours = (common.GREY, common.BLUE, common.RED)
     for label, curvatures in enumerate(([0.0], [10, 20, 30], [-10, -20, -30])):
         for k, degrees in enumerate(curvatures):
-            path = make_trajectories(np.ones(1), np.zeros(1), np.radians([degrees]), LENGTH)[0]
+            path = make_trajectories(np.ones(1), np.zeros(1), np.radians([degrees]), length=LENGTH)[0]
             fan.plot(*path.T, "o-", ms=3, color=colours[label], label=names[label] if k == 0 else None)
     fan.set(title="label curvature (10, 20, 30° per transition)", xlabel="x", ylabel="y", aspect="equal")
     fan.legend(loc="upper left")
@@ -60,29 +71,38 @@ def draw_fig09(trajectories, factors):
     for path, label in list(zip(trajectories, labels))[:300]:
         data.plot(*path.T, color=colours[label], lw=0.6, alpha=0.7)
     data.set(title="300 trajectories of the data set", xlabel="x (trajectory units)", ylabel="y (trajectory units)", aspect="equal")
-    save_figure(figure, OUT, "fig09_dataset" + ("" if EXPERIMENT == "main" else f"_{EXPERIMENT}"))
+    save_figure(figure, OUT, "fig09_dataset")
 
 
 if __name__ == "__main__":
     config = parse_flags(globals())
     if min(TRAJECTORIES, LENGTH) < 1 or STRAIGHT > 1 or SPEED_LOW > SPEED_HIGH:
         stop("--trajectories and --length must be at least 1, --straight at most 1, --speed_low at most --speed_high")
+    limits = {"speed": (SPEED_LOW, SPEED_HIGH), "direction": (-DIRECTION, DIRECTION), "curvature": (-CURVATURE, CURVATURE),
+              "acceleration": (-ACCELERATION, ACCELERATION)}
+    names = FACTORS.split()
+    if "speed" not in names or sorted(names) != sorted(set(names) & set(limits)):
+        stop(f"--factors {FACTORS!r} must name speed, and may name direction, curvature and acceleration, each once")
     rng = np.random.default_rng(SEED)
-    factors = {
-        "speed": rng.uniform(SPEED_LOW, SPEED_HIGH, TRAJECTORIES),
-        "direction": rng.uniform(-1, 1, TRAJECTORIES) * math.radians(DIRECTION),
-        "curvature": rng.uniform(-1, 1, TRAJECTORIES) * math.radians(CURVATURE) * (rng.random(TRAJECTORIES) >= STRAIGHT),
-    }
+    factors = {}
+    for name in names:
+        factors[name] = rng.uniform(*limits[name], TRAJECTORIES)
+        if name in ("direction", "curvature"):
+            factors[name] = np.radians(factors[name])
+    for name in [n for n in names if n in ("curvature", "acceleration")]:
+        factors[name] *= rng.random(TRAJECTORIES) >= STRAIGHT
     trajectories = make_trajectories(**factors, length=LENGTH)
+    ranges = [np.ptp(limits[name]) * (math.pi / 180 if name in ("direction", "curvature") else 1) for name in names]
     path = save(OUT, "dataset", EXPERIMENT, SEED, config, trajectories=trajectories.astype(np.float32),
-                factors=np.stack(list(factors.values()), 1).astype(np.float32), names=np.array(list(factors)))
+                factors=np.stack(list(factors.values()), 1).astype(np.float32), names=np.array(names), ranges=np.array(ranges))
 
-    print(f"Table 1, as run: {TRAJECTORIES} trajectories of T = {LENGTH}")
-    print("factor      distribution            mean      min      max")
-    for name, text in [("speed", f"U({SPEED_LOW:g}, {SPEED_HIGH:g})"), ("direction", f"U(-{DIRECTION:g}, {DIRECTION:g}) deg"),
-                       ("curvature", f"U(-{CURVATURE:g}, {CURVATURE:g}) deg")]:
-        f = factors[name] if name == "speed" else np.degrees(factors[name])
-        print(f"{name:11s} {text:20s} {f.mean():8.3f} {f.min():8.3f} {f.max():8.3f}")
-    print(f"straight    {np.mean(factors['curvature'] == 0):.3f} of them (asked: {STRAIGHT:g})")
+    print(f"Table 1, as run: {TRAJECTORIES} trajectories of T = {LENGTH} in {trajectories.shape[2]}D")
+    print("factor        distribution              mean      min      max   exactly 0")
+    units = {"speed": "", "direction": " deg", "curvature": " deg", "acceleration": " x speed"}
+    for name in names:
+        f = np.degrees(factors[name]) if "deg" in units[name] else factors[name]
+        text = "U({:g}, {:g})".format(*limits[name]) + units[name]
+        print(f"{name:13s} {text:22s} {f.mean():8.3f} {f.min():8.3f} {f.max():8.3f}   {np.mean(f == 0):.3f}")
     print(f"wrote {path}")
-    draw_fig09(trajectories, factors)
+    if EXPERIMENT == "main":
+        draw_fig09(trajectories, factors)

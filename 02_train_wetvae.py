@@ -16,8 +16,8 @@ from torch import nn
 from torch.nn import functional as F
 
 import common
-from common import (LABEL_RULES, Decoder, artifact_name, bootstrap_interval, check_same, cross_talk, factors_of, gaussian_log_prob,
-                    load, load_decoder, parse_flags, plt, read_csv, resumable, save, save_figure, stop, update_csv, weak_labels)
+from common import (LABEL_RULES, Decoder, artifact_name, bootstrap_interval, check_same, cross_talk, factors_of,
+                    load, load_decoder, parse_flags, plt, read_csv, resumable, save, save_figure, spread, stop, update_csv, weak_labels)
 
 EXPERIMENT = "main"    # row of EXPERIMENTS below
 SEED = 0               # random seed
@@ -28,22 +28,48 @@ CHECKPOINT = 1.0       # minutes between checkpoints
 
 DATA = "main"          # experiment of 01 to train on
 DATA_SEED = 0          # and its seed
-LABELS = "speed direction curvature"  # factors with a weak label y^m
+LABELS = "speed direction curvature"  # weak labels y^m, names of LABEL_RULES
+FACTORS = ""           # factors that latents are matched with and measured on ("": the data's); several sets between commas
+BASE = "0 0 0 0"       # value of each axis while another one is traversed
+CIRCLE = False         # direction as a pair of latents on the unit circle: no empty angles (the paper: one Gaussian axis)
 BASELINE = True        # also train the trajectory VAE, the same model without labels
 
 BETA = 9.0             # weight of the KL divergence, Eq. 4
 BASELINE_BETA = 1.0    # of the trajectory VAE: at 9 its latent collapses (KL 0.000), which would make a straw man of it
+BETA_WARM_UP = 0.0     # share of the updates over which beta grows from 0: without, hard data sets lose an axis for good
+OWN_AXIS = False       # true: p(y^m | z^m), label m is read from latent m alone and its classes lie on it in order (Eq. 4: from all of z)
 GAMMA = 10.0           # weight of the label cross-entropies, Eq. 4
 HIDDEN = 64            # width of every unit in Fig 1
-BATCH = 1024           # trajectories per update (the paper: 2048)
-EPOCHS = 36            # the paper: 300
+BATCH = 512            # trajectories per update (the paper: 2048)
+EPOCHS = 24            # the paper: 300
 LEARNING_RATE = 2e-3   # Adam, decays linearly to 0 (the paper: 2e-4, fixed)
 HELD_OUT = 5000        # trajectories kept for |corr|, MIG and SAP
 THREADS = 2            # CPU threads
 
-EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
-    "main": {},
-    "seeds": {},  # the same; each --seed adds its rows to results/wetvae.csv and its points to the figure of all seeds
+FIGURE = ""            # name of the figure drawn
+MODELS, COLUMNS = {"": {}}, ()
+BETA_GAMMA = ((9, 0), (9, 1), (1, 10), (3, 10), (9, 10))  # of Fig 10
+NONE = dict(LABELS="", GAMMA=0.0, BETA=BASELINE_BETA, BETA_WARM_UP=0.0)  # the trajectory VAE
+MENDED = dict(OWN_AXIS=True, BETA_WARM_UP=0.5, EPOCHS=12)  # without these the harder data sets lose or mix axes
+EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above; MODELS: the same for each model it
+    # trains (end of the file's name and what differs); COLUMNS of its figure: title, model, T
+    "main": dict(MODELS={"": {}, "none": NONE}, FIGURE="fig04_latent_traversals", COLUMNS=[
+        ("(a) WET-VAE, T = 1", "main", 1), ("(b) WET-VAE, T = 5", "main", 5), ("(c) WET-VAE, T = 10", "main", 10),
+        ("(d) trajectory VAE, T = 5", "main_none", 5)]),
+    "seeds": dict(MODELS={"": {}, "none": NONE}, FIGURE="seeds_wetvae"),  # each --seed adds rows to results/ and points to the figure
+    "beta_gamma": dict(EPOCHS=12, FIGURE="fig10_beta_gamma", MODELS={f"b{b}_g{g}": dict(BETA=float(b), GAMMA=float(g)) for b, g in BETA_GAMMA},
+                       COLUMNS=[(f"({c}) β = {b}, γ = {g}", f"beta_gamma_b{b}_g{g}", 5) for c, (b, g) in zip("abcde", BETA_GAMMA)]),
+    "polar": MENDED | dict(DATA="polar", LABELS="speed angle", MODELS={"": {}, "none": NONE | dict(FACTORS="speed direction, x y")}),
+    "cartesian": MENDED | dict(DATA="polar", LABELS="x y", FACTORS="x y", FIGURE="fig11_polar_cartesian", COLUMNS=[
+        ("polar labels", "polar", 5), ("Cartesian labels", "cartesian", 5), ("no labels", "polar_none", 5)]),
+    "speed_acc": MENDED | dict(EPOCHS=24, BETA=4.0, DATA="speed_acc", LABELS="velocity acceleration", BASE="-1 0", MODELS={"": {}, "none": NONE},
+                               FIGURE="fig12_speed_acceleration", COLUMNS=[("WET-VAE", "speed_acc", 5), ("no labels", "speed_acc_none", 5)]),
+    "four_factors": MENDED | dict(
+        EPOCHS=36, DATA="four_factors", LABELS="speed angle curvature acceleration", MODELS={"": {}, "circle": dict(CIRCLE=True)},
+        FIGURE="fig13_four_factors", COLUMNS=[("Gaussian axis", "four_factors", 5), ("circle", "four_factors_circle", 5)]),
+    "full": MENDED | dict(
+        DATA="full", LABELS="speed angle curvature", MODELS={"": {}, "circle": dict(CIRCLE=True)},
+        FIGURE="full_circle_traversals", COLUMNS=[("Gaussian axis", "full", 5), ("circle", "full_circle", 5)]),
 }
 
 
@@ -63,22 +89,68 @@ class Encoder(nn.Module):
         return self.head(state[0]).chunk(2, 1)
 
 
-def objective(encoder, decoder, classifiers, x, y, sizes):
+def sample(mean, log_var, circle):
+    """Reparameterised latents (B, L) and D_KL(q || prior) of each (B, L). circle: the first two are a point at an angle whose mean is the
+    direction of mean[:, :2], with noise of one standard deviation, against a uniform prior: no ends and no middle. Its KL takes the
+    noise for unwrapped (0.1 nats too little at most)."""
+    z = mean + torch.randn_like(mean) * (0.5 * log_var).exp()
+    kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var)
+    if circle:
+        angle = torch.atan2(mean[:, 1], mean[:, 0]) + (z - mean)[:, 0]
+        z = torch.cat([angle.cos()[:, None], angle.sin()[:, None], z[:, 2:]], 1)
+        kl = torch.cat([torch.relu(0.5 * (math.log(2 * math.pi) - 1 - log_var[:, :1])), kl[:, 2:]], 1)
+    return z, kl
+
+
+def gaussian_log_prob(x, mean, log_var):
+    """log N(x; mean, exp(log_var)), elementwise."""
+    return -0.5 * ((x - mean) ** 2 * torch.exp(-log_var) + log_var + math.log(2 * math.pi))
+
+
+class Ordered(nn.Module):
+    """p(y^m | z^m) of a label whose classes follow one another along its axis (softmax of lines with slopes in that order) or round its
+    circle (of cosines). Without the order classes settle in any: straight at one end of curvature, left and right side by side."""
+
+    def __init__(self, classes, circle):
+        super().__init__()
+        turns = torch.arange(classes) * (2 * math.pi / classes)
+        order = [0, 1, -1] if classes == 3 else range(classes)  # straight lies between left and right, none between up and down
+        self.register_buffer("order", torch.stack([turns.cos(), turns.sin()]) if circle else torch.tensor([list(order)], dtype=torch.float32))
+        self.scale, self.bias = nn.Parameter(torch.tensor(3.0)), nn.Parameter(torch.zeros(classes))
+
+    def forward(self, z):
+        return self.scale * z @ self.order + self.bias
+
+
+def label_decoders(labels, z_dim, circle):
+    """p(y^m | .) of each label and the part of z it reads: all of it, or with OWN_AXIS its own latent (an angle's circle: the first two)."""
+    heads, parts, rest = [], [], iter(range(2 * circle, z_dim))
+    for name in labels:
+        classes, closed = LABEL_RULES[name][0], circle and name == "angle"
+        if OWN_AXIS:
+            parts.append(slice(0, 2) if closed else slice(m := next(rest), m + 1))
+            heads.append(Ordered(classes, closed))
+        else:
+            parts.append(slice(None))
+            heads.append(nn.Sequential(nn.Linear(z_dim, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, classes)))
+    return nn.ModuleList(heads), parts
+
+
+def objective(encoder, decoder, classifiers, parts, x, y, sizes):
     """The three terms of Eq. 4: sum_t log p(s_t | s_<t, z), sum_m log p(y^m | z), D_KL(q(z | tau, y) || N(0, 1)). Sums over
     time, dimensions and labels, as the equation has them; mean over the batch. x (B, T, x_dim), y (B, M) classes."""
     mean, log_var = encoder(x, one_hot_labels(y, sizes))
-    z = mean + torch.randn_like(mean) * (0.5 * log_var).exp()
-    states = gaussian_log_prob(x, *decoder(z, x.shape[1])).sum((1, 2)).mean()
-    labels = sum((-F.cross_entropy(head(z), y[:, m]) for m, head in enumerate(classifiers)), torch.zeros(()))
-    kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1).mean()
-    return states, labels, kl
+    z, kl = sample(mean, log_var, len(decoder.circle) > 0)
+    states = gaussian_log_prob(x, *decoder.unroll(z, x.shape[1])).sum((1, 2)).mean()
+    labels = sum((-F.cross_entropy(head(z[:, parts[m]]), y[:, m]) for m, head in enumerate(classifiers)), torch.zeros(()))
+    return states, labels, kl.sum(1).mean()
 
 
-def train(x, y, sizes, z_dim, variant, config):
-    """Maximise Eq. 4. x (N, T, x_dim) displacements, y (N, M) classes, sizes: number of classes of each label (none: [])."""
-    torch.manual_seed(SEED)
-    encoder, decoder = Encoder(x.shape[2], sum(sizes), z_dim), Decoder(z_dim, x.shape[2], HIDDEN)
-    classifiers = nn.ModuleList(nn.Sequential(nn.Linear(z_dim, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, k)) for k in sizes)
+def train(encoder, decoder, x, y, sizes, variant, config):
+    """Maximise Eq. 4. x (N, T, x_dim) displacements, y (N, M) classes, sizes: number of classes of each label (none: []).
+    Trains encoder and decoder in place and returns the seconds it took."""
+    z_dim = encoder.head[2].out_features // 2
+    classifiers, parts = label_decoders(config["LABELS"].split(), z_dim, len(decoder.circle) > 0)
     model = nn.ModuleList([encoder, decoder, classifiers])
     optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE, fused=True)
     epoch, seconds, last_save, per_epoch = 0, 0.0, time.time(), len(x) // BATCH
@@ -92,10 +164,12 @@ def train(x, y, sizes, z_dim, variant, config):
     while epoch < EPOCHS:
         clock = time.time()
         for i, rows in enumerate(torch.randperm(len(x))[:per_epoch * BATCH].view(per_epoch, BATCH)):
+            progress = (epoch + i / per_epoch) / EPOCHS
             for group in optimizer.param_groups:
-                group["lr"] = LEARNING_RATE * (1 - (epoch + i / per_epoch) / EPOCHS)
-            states, labels, kl = objective(encoder, decoder, classifiers, x[rows], y[rows], sizes)
-            loss = -(states + GAMMA * labels - (BETA if sizes else BASELINE_BETA) * kl)
+                group["lr"] = LEARNING_RATE * (1 - progress)
+            states, labels, kl = objective(encoder, decoder, classifiers, parts, x[rows], y[rows], sizes)
+            beta = config["BETA"] * (min(1, progress / config["BETA_WARM_UP"]) if config["BETA_WARM_UP"] else 1)
+            loss = -(states + config["GAMMA"] * labels - beta * kl)  # Eq. 4
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -112,25 +186,56 @@ def train(x, y, sizes, z_dim, variant, config):
             save(OUT, "wetvae-checkpoint", variant, SEED, config, model=model.state_dict(), optimizer=optimizer.state_dict(),
                  epoch=epoch, seconds=seconds, rng=torch.get_rng_state())
             last_save = time.time()
-    return encoder, decoder, seconds
+    return seconds
 
 
 def one_hot_labels(y, sizes):
     return torch.cat([F.one_hot(y[:, m], k).float() for m, k in enumerate(sizes)] or [torch.zeros(len(y), 0)], 1)
 
 
-def match_axes(z, factors):
+def match_axes(z, factors, names):
     """Alg. 1, "Test: check factors in z": one latent per factor, best total |correlation|.
 
     z (N, M), factors (N, M). Returns the signed permutation (M, M) that turns canonical z, where axis m is factor m
-    and + is more of it, into the latents of training, and the |correlations| (M,)."""
-    M = z.shape[1]
-    corr = np.corrcoef(z.T, factors.T)[:M, M:]  # latents x factors
+    and + is more of it, into the latents of training, and the |correlations| (M,). A direction's circle may be cut open anywhere on
+    an axis: its correlation is that with the best cut."""
+    M, corr = z.shape[1], np.zeros((z.shape[1], len(names)))  # latents x factors
+    for m, name in enumerate(names):
+        cuts = np.linspace(-math.pi, math.pi, 361)[1:] if name == "direction" else [0.0]
+        tries = np.array([np.corrcoef(z.T, (factors[:, m] - c + math.pi) % (2 * math.pi) if len(cuts) > 1 else factors[:, m])[:M, M]
+                          for c in cuts])
+        corr[:, m] = tries[abs(tries).argmax(0), np.arange(M)]
     best = max(itertools.permutations(range(M)), key=lambda p: sum(abs(corr[p[m], m]) for m in range(M)))
     axes = np.zeros((M, M), np.float32)
     for m, latent in enumerate(best):
         axes[m, latent] = np.sign(corr[latent, m]) or 1
     return torch.from_numpy(axes), np.array([abs(corr[best[m], m]) for m in range(M)])
+
+
+def match_circle(pair, direction):
+    """The same for a pair of latents on a circle (N, 2) and a direction (N,): sign and offset such that angle = sign direction +
+    offset, and how closely (1: always, 0: not at all)."""
+    angle = np.arctan2(pair[:, 1], pair[:, 0])
+    mean = {sign: np.exp(1j * (angle - sign * direction)).mean() for sign in (1, -1)}
+    sign = max(mean, key=lambda k: abs(mean[k]))
+    return sign, np.angle(mean[sign]), abs(mean[sign])
+
+
+def canonical_axes(decoder, z, factors, names):
+    """Find which latent (N, L) is which factor (N, M) and tell the decoder; returns the latents as canonical z (N, M) and |corr| (M,)."""
+    if not len(decoder.circle):
+        decoder.axes, corr = match_axes(z, factors, names)
+        return z @ decoder.axes.numpy().T, corr
+    d, corr = names.index("direction"), np.zeros(len(names))
+    rest = [m for m in range(len(names)) if m != d]
+    axes, corr[rest] = match_axes(z[:, 2:], factors[:, rest], [names[m] for m in rest])
+    sign, offset, corr[d] = match_circle(z[:, :2], factors[:, d])
+    decoder.axes[:] = 0
+    decoder.axes[rest, 2:], decoder.circle = axes, torch.tensor([d, sign, offset], dtype=torch.float32)
+    canonical = z @ decoder.axes.numpy().T
+    canonical[:, d] = ((np.arctan2(z[:, 1], z[:, 0]) - offset) * sign + math.pi) % (2 * math.pi) - math.pi
+    canonical[:, d] *= 3 / (2 * math.pi)
+    return canonical, corr
 
 
 def mig_and_sap(z, factors, bins=20):
@@ -154,74 +259,99 @@ def mig_and_sap(z, factors, bins=20):
 
 
 def traverse(decoder, axis, values, steps):
-    """Decoded displacements (len(values), steps, 2) while one axis runs over values and the others are 0."""
-    z = torch.zeros(len(values), len(decoder.axes))
+    """Decoded displacements (len(values), steps, x_dim) while one axis runs over values and the others stay at BASE."""
+    z = torch.tensor([float(v) for v in BASE.split()[:len(decoder.axes)]]).repeat(len(values), 1)
     z[:, axis] = torch.as_tensor(values, dtype=torch.float32)
     with torch.no_grad():
         return decoder(z, steps)[0].double().numpy()
 
 
-def measure(variant, decoder, abs_corr, z, factors, names, seconds):
+def largest_gap(decoder, axis):
+    """The largest empty angle in degrees: of the directions that a dense traversal of z_dir decodes to at a speed of at least 0.1."""
+    reach = 1.5 if len(decoder.circle) else 3.0  # a circle is closed after 1.5
+    first = traverse(decoder, axis, np.linspace(-reach, reach, 3001), 1)
+    moving = first[np.linalg.norm(first[:, 0], axis=1) > 0.1]
+    return 360 - math.degrees(spread(factors_of(moving)["direction"], "direction")) if len(moving) else 360.0
+
+
+def measure(labels, settings, decoder, abs_corr, z, factors, names, ranges, seconds):
     """Print and save what the model learned: one row per factor in results/wetvae.csv, the matrix in results/crosstalk.csv."""
-    curves = [factors_of(traverse(decoder, i, np.linspace(-1.5, 1.5, 61), LENGTH)) for i in range(len(names))]
-    C, purity = cross_talk(curves, names)
+    curves = [factors_of(traverse(decoder, i, np.linspace(-1.5, 1.5, 61), LENGTH), "acceleration" in names) for i in range(len(names))]
+    C, purity = cross_talk(curves, names, ranges)
     mig, sap = mig_and_sap(z, factors)
-    labels = "none" if variant.endswith("none") else EXPERIMENT
-    print(f"\n{variant}: cross-talk C[axis, factor], purity, |corr|, MIG, SAP; decoded factor over z in [-1.5, 1.5]")
+    print(f"\n{EXPERIMENT}, {labels}: cross-talk C[axis, factor], purity, |corr|, MIG, SAP; decoded factor over z in [-1.5, 1.5]")
     rows, cells = [], []
     for i, name in enumerate(names):
-        curve = curves[i][name] if name == "speed" else np.degrees(curves[i][name])
+        curve = np.degrees(curves[i][name]) if name in ("direction", "curvature") else curves[i][name]
         low, high = curve.min(), curve.max()
-        print(f"z_{name:10s} " + " ".join(f"{c:5.2f}" for c in C[i]) + f"   purity {purity[i]:.3f}  |corr| {abs_corr[i]:.3f}  "
-              f"MIG {mig[i]:.3f}  SAP {sap[i]:.3f}  {low:7.2f} .. {high:.2f}" + ("" if name == "speed" else " deg"))
-        rows.append(dict(experiment=EXPERIMENT, seed=SEED, labels=labels,
-                         beta=BASELINE_BETA if labels == "none" else BETA, gamma=GAMMA, factor=name,
+        gap = largest_gap(decoder, i) if name == "direction" and ranges[i] > 4 else ""
+        print(f"z_{name:12s} " + " ".join(f"{c:5.2f}" for c in C[i]) + f"   purity {purity[i]:.3f}  |corr| {abs_corr[i]:.3f}  "
+              f"MIG {mig[i]:.3f}  SAP {sap[i]:.3f}  {low:7.2f} .. {high:.2f}" + (f"  largest empty angle {gap:.1f} deg" if gap != "" else ""))
+        rows.append(dict(experiment=EXPERIMENT, seed=SEED, labels=labels, beta=settings["BETA"], gamma=settings["GAMMA"], factor=name,
                          abs_corr=abs_corr[i], purity=purity[i], range_low=low, range_high=high, mig=mig[i], sap=sap[i],
-                         largest_gap_deg="", train_seconds=round(seconds)))
+                         largest_gap_deg=gap, train_seconds=round(seconds)))
         cells += [dict(experiment=EXPERIMENT, seed=SEED, labels=labels, axis=name, factor=other, crosstalk=C[i, j])
                   for j, other in enumerate(names)]
     update_csv(Path(OUT) / "results" / "wetvae.csv", rows, ("experiment", "seed", "labels", "factor"))
     update_csv(Path(OUT) / "results" / "crosstalk.csv", cells, ("experiment", "seed", "labels", "axis", "factor"))
 
 
-def draw_fig04(decoders, names):
-    """Fig 4: a row per latent, a column per (model, T). Line colour: value of the latent, -1.5 to 1.5."""
-    columns = [("(a) WET-VAE, T = 1", 0, 1), ("(b) WET-VAE, T = 5", 0, 5), ("(c) WET-VAE, T = 10", 0, 10),
-               ("(d) trajectory VAE, T = 5", 1, 5)][:4 if len(decoders) > 1 else 3]
-    figure, axes = plt.subplots(len(names), len(columns), figsize=(2.6 * len(columns) + 0.8, 2.5 * len(names)), squeeze=False)
-    values, colours = np.linspace(-1.5, 1.5, 13), plt.get_cmap(common.TRAVERSAL_MAP)(np.linspace(0, 0.95, 13))
-    for j, (title, model, steps) in enumerate(columns):
-        for i in range(len(names)):
-            paths = np.pad(traverse(decoders[model], i, values, steps).cumsum(1), ((0, 0), (1, 0), (0, 0)))
-            for path, colour in zip(paths, colours):
-                axes[i, j].plot(*path.T, ".-", ms=3, lw=1, color=colour)
-            label = f"z_{names[i]}" if model == 0 else f"latent nearest {names[i]}"
-            axes[i, j].set(title=title if i == 0 else None, xlabel="x (trajectory units)" if i == len(names) - 1 else None,
-                           ylabel=f"{label}\ny" if j == 0 or model else "")
-            axes[i, j].set_aspect("equal", "datalim")
-    bar = figure.colorbar(plt.cm.ScalarMappable(plt.Normalize(-1.5, 1.5), common.TRAVERSAL_MAP), ax=axes, shrink=0.5)
-    bar.set_label("value of the traversed latent, others 0")
-    save_figure(figure, OUT, "fig04_latent_traversals" + ("" if EXPERIMENT == "main" else f"_{EXPERIMENT}"))
+def draw_traversals(columns):
+    """Fig 4, 10, 11, 12, 13: a row per axis, a column per (title, model, T). Lines are coloured by the value of the latent; where paths
+    would hide one another (one dimension, acceleration), points are coloured by time and the latent is on the y axis."""
+    models = [load(OUT, "wetvae", variant, SEED, quiet=True) for _, variant, _ in columns]
+    rows = len(models[0]["names"])
+    figure, axes = plt.subplots(rows, len(columns), figsize=(2.6 * len(columns) + 0.8, 2.4 * rows), squeeze=False)
+    values, lined = np.linspace(-1.5, 1.5, 13), False
+    colours = plt.get_cmap(common.TRAVERSAL_MAP)(np.linspace(0, 0.95, 13))
+    for j, ((title, _, steps), model) in enumerate(zip(columns, models)):
+        decoder, labelled = load_decoder(model), bool(model["config"]["LABELS"])
+        for i, name in enumerate(model["names"]):
+            ax, axis = axes[i, j], f"z_{name}" if labelled else f"latent nearest {name}"
+            same = j and model["names"] == models[0]["names"] and labelled
+            paths = np.pad(traverse(decoder, i, values, steps).cumsum(1), ((0, 0), (1, 0), (0, 0)))
+            if paths.shape[2] == 1 or name == "acceleration":
+                for t, colour in enumerate(plt.get_cmap("plasma")(np.linspace(0, 0.85, steps + 1))):
+                    ax.plot(paths[:, t, 0], values, ".", color=colour, label=f"t = {t}")
+                ax.set(ylabel="" if same else axis)
+                if (i, j) == (rows - 1, len(columns) - 1):
+                    ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1))
+            else:
+                for path, colour in zip(paths, colours):
+                    ax.plot(*path.T, ".-", ms=3, lw=1, color=colour)
+                ax.set(ylabel="" if same else f"{axis}\ny")
+                ax.set_aspect("equal", "datalim")
+                lined = True
+            ax.set(title=title if i == 0 else None, xlabel="x (trajectory units)" if i == rows - 1 else None)
+    if lined:
+        bar = figure.colorbar(plt.cm.ScalarMappable(plt.Normalize(-1.5, 1.5), common.TRAVERSAL_MAP), ax=axes, shrink=0.5)
+        bar.set_label("value of the traversed latent, others " + BASE[:1 if len(set(BASE.split())) == 1 else None])
+    save_figure(figure, OUT, FIGURE)
 
 
-def draw_seeds():
-    """Purity and |corr| of every seed trained so far, of both models: each seed a point, the mean with its 95 % bootstrap interval."""
+def draw_seeds(name):
+    """Purity, |corr| and the largest empty angle of every seed trained so far: each seed a point, the mean with its 95 % interval."""
     rows = [row for row in read_csv(Path(OUT) / "results" / "wetvae.csv") if row["experiment"] == EXPERIMENT]
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True)
-    for ax, measure in zip(axes, ("purity", "abs_corr")):
-        for labels, name, colour, shift in ((EXPERIMENT, "WET-VAE", common.BLUE, -0.15), ("none", "trajectory VAE", common.RED, 0.15)):
-            for i, factor in enumerate(LABELS.split()):
-                v = np.array([float(row[measure]) for row in rows if row["labels"] == labels and row["factor"] == factor])
-                if len(v):
-                    low, high = bootstrap_interval(v)
-                    spread = np.linspace(-0.08, 0.08, len(v))
-                    ax.plot(i + shift + spread, v, ".", color=colour, alpha=0.6, label=f"{name}, {len(v)} seeds" if i == 0 else None)
-                    ax.errorbar(i + shift, v.mean(), [[v.mean() - low], [high - v.mean()]], color="black", fmt="_", ms=14, capsize=3)
-                    print(f"{name:15s} {measure:9s} z_{factor:10s} mean {v.mean():.3f} [{low:.3f}, {high:.3f}], worst {v.min():.3f}, n = {len(v)}")
-        ax.set(xticks=range(len(LABELS.split())), xticklabels=[f"z_{f}" for f in LABELS.split()], ylim=(0, 1.02),
-               ylabel={"purity": "purity of the axis", "abs_corr": "|corr| with its factor"}[measure])
+    factors, models = (list(dict.fromkeys(row[key] for row in rows)) for key in ("factor", "labels"))
+    columns = {"purity": "purity of the axis", "abs_corr": "|corr| with its factor", "largest_gap_deg": "largest empty angle (degrees)"}
+    columns = {key: text for key, text in columns.items() if any(row[key] for row in rows)}
+    figure, axes = plt.subplots(1, len(columns), figsize=(4.2 * len(columns), 3.2))
+    for ax, (column, text) in zip(axes, columns.items()):
+        shown = [f for f in factors if any(row[column] for row in rows if row["factor"] == f)]
+        for k, (labels, colour) in enumerate(zip(models, (common.BLUE, common.RED))):
+            for i, factor in enumerate(shown):
+                v = np.array([float(row[column]) for row in rows if (row["labels"], row["factor"]) == (labels, factor) and row[column]])
+                low, high = bootstrap_interval(v)
+                at = i + 0.3 * k - 0.15
+                title = {"none": "trajectory VAE", "circle": "circle"}.get(labels, "Gaussian axis" if "circle" in models else "WET-VAE")
+                ax.plot(at + np.linspace(-0.08, 0.08, len(v)), v, ".", color=colour, alpha=0.6, label=f"{title}, {len(v)} seeds" if i == 0 else None)
+                ax.errorbar(at, v.mean(), [[v.mean() - low], [high - v.mean()]], color="black", fmt="_", ms=14, capsize=3)
+                worst = v.max() if column == "largest_gap_deg" else v.min()
+                print(f"{title:15s} {column:15s} z_{factor:12s} mean {v.mean():7.3f} [{low:.3f}, {high:.3f}], worst {worst:.3f}, n = {len(v)}")
+        ax.set(xticks=range(len(shown)), xticklabels=[f"z_{f}" for f in shown], ylabel=text, xlim=(-0.5, len(shown) - 0.5))
+        ax.set_ylim(0, None if column == "largest_gap_deg" else 1.02)
     axes[0].legend(loc="lower left")
-    save_figure(figure, OUT, "seeds_wetvae")
+    save_figure(figure, OUT, name)
 
 
 if __name__ == "__main__":
@@ -230,38 +360,50 @@ if __name__ == "__main__":
         stop(f"no weak label {sorted(unknown)[0]!r}; allowed: {' '.join(LABEL_RULES)}")
     torch.set_num_threads(THREADS)
     dataset = load(OUT, "dataset", DATA, DATA_SEED)
-    names = [str(name) for name in dataset["names"]]
-    factors = dataset["factors"]
+    truth = dict(zip(map(str, dataset["names"]), dataset["factors"].T.astype(np.float64)))
+    ranges = dict(zip(truth, dataset["ranges"].tolist()))
     x = torch.from_numpy(np.diff(dataset["trajectories"], axis=1))  # displacements: the model is position-agnostic
+    if x.shape[2] == 2:
+        truth |= dict(x=truth["speed"] * np.cos(truth["direction"]), y=truth["speed"] * np.sin(truth["direction"]))
+        ranges |= dict(x=2.0, y=2.0)
     LENGTH = x.shape[1]
     test = slice(len(x) - HELD_OUT, None)
     if not 2 * BATCH <= len(x) - HELD_OUT:
         stop(f"{len(x)} trajectories are too few for --batch {BATCH} and --held_out {HELD_OUT}; make more with 01_make_dataset.py")
 
-    decoders = []
-    for variant, label_names in [(EXPERIMENT, LABELS.split())] + [(EXPERIMENT + "_none", [])] * BASELINE:
-        sizes = [LABEL_RULES[name][0] for name in label_names]
-        y = torch.zeros(len(x), 0, dtype=torch.int64)
-        if label_names:
-            y = torch.from_numpy(weak_labels(dict(zip(names, factors.T.astype(np.float64))), label_names))
+    for key, changes in MODELS.items():
+        if key == "none" and not BASELINE:
+            continue
+        variant, settings = f"{EXPERIMENT}_{key}".strip("_"), config | changes
+        labels = settings["LABELS"].split()
+        sizes = [LABEL_RULES[name][0] for name in labels]
+        y = torch.from_numpy(weak_labels(truth, labels)) if labels else torch.zeros(len(x), 0, dtype=torch.int64)
+        sets = [part.split() for part in (settings["FACTORS"] or " ".join(map(str, dataset["names"]))).split(",")]
+        circle = settings["CIRCLE"] and "direction" in sets[0]
+        torch.manual_seed(SEED)
+        encoder = Encoder(x.shape[2], sum(sizes), len(sets[0]) + circle)
+        decoder = Decoder(len(sets[0]), x.shape[2], HIDDEN, circle)
         if TRAIN:
-            print(f"\n{variant}: {'WET-VAE' if label_names else 'trajectory VAE, no labels'}, seed {SEED}")
-            train_set = slice(len(x) - HELD_OUT)
-            encoder, decoder, seconds = train(x[train_set], y[train_set], sizes, len(names), variant, config)
-            with torch.no_grad():
-                mean, _ = encoder(x[test], one_hot_labels(y[test], sizes))
-            decoder.axes, abs_corr = match_axes(mean.numpy(), factors[test])
-            save(OUT, "wetvae", variant, SEED, config, encoder=encoder.state_dict(), decoder=decoder.state_dict(), names=names,
-                 abs_corr=abs_corr.tolist(), seconds=seconds)
-        model = load(OUT, "wetvae", variant, SEED)
-        check_same(model, config, ("DATA", "LABELS", "HIDDEN"))
-        encoder, decoder = Encoder(x.shape[2], sum(sizes), len(names)), load_decoder(model)
-        encoder.load_state_dict(model["encoder"])
+            print(f"\n{variant}: {'WET-VAE, labels ' + ' '.join(labels) if labels else 'trajectory VAE, no labels'}, beta {settings['BETA']:g}, "
+                  f"gamma {settings['GAMMA']:g}, seed {SEED}")
+            seconds = train(encoder, decoder, x[:-HELD_OUT], y[:-HELD_OUT], sizes, variant, settings)
+        else:
+            model = load(OUT, "wetvae", variant, SEED)
+            check_same(model, settings, ("DATA", "LABELS", "HIDDEN", "CIRCLE"))
+            encoder.load_state_dict(model["encoder"])
+            decoder, seconds = load_decoder(model), model["seconds"]
         with torch.no_grad():
-            mean, _ = encoder(x[test], one_hot_labels(y[test], sizes))
-        measure(variant, decoder, model["abs_corr"], (mean @ decoder.axes.T).numpy(), factors[test], names, model["seconds"])
-        decoders.append(decoder)
+            latents = encoder(x[test], one_hot_labels(y[test], sizes))[0].double().numpy()
+        for names in reversed(sets):  # the last of them, the first set, is the one that is kept
+            factors = np.stack([truth[name][test] for name in names], 1)
+            z, abs_corr = canonical_axes(decoder, latents, factors, names)
+            measure(key or EXPERIMENT, settings, decoder, abs_corr, z, factors, names, [ranges[name] for name in names], seconds)
+        if TRAIN:
+            save(OUT, "wetvae", variant, SEED, settings, encoder=encoder.state_dict(), decoder=decoder.state_dict(), names=names,
+                 ranges=[ranges[name] for name in names], abs_corr=abs_corr.tolist(), seconds=seconds)
     if EXPERIMENT == "seeds":
-        draw_seeds()
-    else:
-        draw_fig04(decoders, names)
+        draw_seeds(FIGURE)
+    elif FIGURE:
+        draw_traversals([column for column in COLUMNS if BASELINE or not column[1].endswith("none")])
+        if EXPERIMENT == "full":
+            draw_seeds("seeds_full_circle")

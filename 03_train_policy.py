@@ -2,20 +2,21 @@
 
 Reads runs/wetvae_*.pt. The reward is the decoder's log-likelihood of the step just made (Eq. 6), computed when a batch is
 sampled, so that any stored step can be relabelled with a fresh skill. Writes runs/policy_<experiment>_seed<seed>.pt,
-Fig 5, the learning curve (figures/, results/) and a row of results/policies.csv.
-Takes 56 minutes on two cores that do nothing else (63 updates/s; AMD EPYC 7003, no AVX-512). Expect, n = 1 (seed 0): tracking error 0.22 with
-mean and 0.18 with sampled actions, direction error 3.8 degrees, middle and fast skills at 0.9 of their speed, slow ones at 0.3.
+Fig 5 (15, 16), the learning curve (figures/, results/) and a row of results/policies.csv.
+Takes 45 minutes on one core (45 updates/s; AMD EPYC 7003, no AVX-512). Expect, n = 1 (seed 0): tracking error 0.18 with mean and
+0.22 with sampled actions, direction error 4.3 degrees, middle and fast skills at 0.85 and 0.90 of their speed, slow ones at 0.33.
 """
 import math
 import time
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import torch
 from torch import nn
 
 import common
-from common import (FULL_RANGE, STEP_SCALE, Actor, Robots, ant_spec, artifact_name, check_same, cross_talk, execute, factors_of, load,
+from common import (Actor, Robots, ant_spec, artifact_name, check_same, cross_talk, egocentric, execute, factors_of, first_step, load,
                     load_actor, load_decoder, parse_flags, plt, predict, resumable, save, save_figure, stop, update_csv)
 
 EXPERIMENT = "ant_semi"  # row of EXPERIMENTS below
@@ -23,9 +24,8 @@ SEED = 0                 # random seed
 OUT = "."                # folder for runs/, figures/ and results/
 TRAIN = True             # false: only measure and draw what is already trained
 RESUME = False           # true: continue from the last checkpoint
-THREADS = 2              # CPU threads
-UPDATES = 200_000        # SAC updates; the schedules below run over them (the paper: 1.92 million)
-POLISH = 12_000          # further updates at TEMPERATURE_END
+THREADS = 1              # CPU threads; two trainings on one each make half as many updates again as one on two
+UPDATES = 120_000        # SAC updates; the schedules below run over them (the paper: 1.92 million)
 MINUTES = 0.0            # if not 0, the schedules run out with this clock instead, whatever UPDATES says
 CHECKPOINT = 5.0         # minutes between checkpoints, which are made after a report
 REPORTS = 40             # printed lines and points of the learning curve
@@ -33,7 +33,9 @@ REPORTS = 40             # printed lines and points of the learning curve
 DECODER = "main"         # experiment of 02 whose decoder is the reward
 DECODER_SEED = 0         # and its seed
 METHOD = "wedis"         # named in results/
-ROBOT = "ant"            # named in results/
+ROBOT = "ant"            # ant or half_cheetah
+STEP_SCALE = 0.1         # metres per trajectory unit, App. A.1.3: 1/10, Half-Cheetah 1/5
+DIRECTIONS = 5           # of the tracking grid: from -1.5 to 1.5 of z_dir
 
 ROBOTS = 64              # environments that step together
 EPISODE = 200            # steps until a robot starts anew; not terminal: the value beyond is bootstrapped
@@ -44,22 +46,63 @@ UPDATES_PER_STEP = 8     # updates after each step of all robots
 BATCH = 256              # App. A.1.3
 RELABELLED = 0.5         # share of a batch given a fresh skill from the prior (hindsight)
 
+EGOCENTRIC = True        # the networks see state and wanted step from the torso, up to quarter turns (false: s and z, the paper)
 HIDDEN = 256             # width of the two hidden layers (the paper: 512)
 LEARNING_RATE = 1e-3     # Adam, decays linearly to 0 over the second half (the paper: 3e-4, fixed)
 DISCOUNT = 0.97          # gamma of Eq. 1 (the paper: 0.99)
 SMOOTHING = 0.01         # of the target value network, App. A.1.3
 REWARD_SCALE = 0.1       # the paper: 1
-TEMPERATURE = 0.01       # alpha, weight of the entropy, App. A.1.3
-TEMPERATURE_END = 0.001  # while polishing: the paper's 0.01 times REWARD_SCALE; the mean action nears what the policy does
+TEMPERATURE = 0.003      # alpha, weight of the entropy (the paper: 0.01, which is 0.001 at our reward scale)
 VARIANCE_SCALE = 0.05    # decoder variance -> square metres, App. A.1.3: 1/20
 FLOOR_START = 0.04       # metres, least standard deviation of the reward: a sharp one makes standing still a trap
-FLOOR_END = 0.01         # shrinks to this between half and nine tenths of the updates: teaches the slow skills
+FLOOR_END = 0.01         # shrinks to this between 0.15 and 0.6 of the updates: teaches the slow skills
 
 COVERAGE = 200           # random skills whose visited cells of 1 m are counted at the end
 
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
     "ant_semi": {},
+    "ant_full": dict(DECODER="full_circle", DIRECTIONS=16),                                                            # Fig 15
+    "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, EGOCENTRIC=False),                 # Fig 16
 }
+
+
+def half_cheetah_spec():
+    """The Half-Cheetah of the MuJoCo benchmarks (6 hinges on a rail), built in code. nq 9, nv 9, nu 6, Euler at 0.01 s."""
+    spec = mujoco.MjSpec()
+    spec.modelname, spec.compiler.degree = "cheetah", False
+    spec.option.timestep = 0.01
+    joint, geom = spec.default.joint, spec.default.geom
+    joint.armature, joint.limited, joint.solimp_limit[:3], joint.solref_limit = 0.1, True, [0, 0.8, 0.03], [0.02, 1]
+    geom.condim, geom.conaffinity, geom.friction, geom.solimp[:3], geom.rgba = 3, 0, [0.4, 0.1, 0.1], [0, 0.8, 0.01], [0.8, 0.6, 0.4, 1]
+    geom.density = 660.8849500774735  # 14 kg in all
+
+    def capsule(body, name, x, z, angle, half_length):
+        body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.046, half_length, 0], pos=[x, 0, z],
+                      quat=[math.cos(angle / 2), 0, math.sin(angle / 2), 0])
+
+    spec.worldbody.add_light(pos=[0, 0, 1.3], dir=[0.2, 0.4, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[40, 40, 40], conaffinity=1, rgba=[0.85, 0.88, 0.85, 1])
+    torso = spec.worldbody.add_body(name="torso", pos=[0, 0, 0.7])
+    for name, kind, axis in (("rootx", "SLIDE", [1, 0, 0]), ("rootz", "SLIDE", [0, 0, 1]), ("rooty", "HINGE", [0, 1, 0])):
+        torso.add_joint(name=name, type=getattr(mujoco.mjtJoint, f"mjJNT_{kind}"), axis=axis, armature=0, limited=False)
+    torso.add_geom(name="torso", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[-0.5, 0, 0, 0.5, 0, 0], size=[0.046, 0, 0])
+    capsule(torso, "head", 0.6, 0.1, 0.87, 0.15)
+    for part in (  # name, position, joint: range, stiffness, damping; geom: x, z, angle, half length; gear
+            [("bthigh", [-0.5, 0, 0], [-0.52, 1.05], 240, 6, (0.1, -0.13, -3.8, 0.145), 120),
+             ("bshin", [0.16, 0, -0.25], [-0.785, 0.785], 180, 4.5, (-0.14, -0.07, -2.03, 0.15), 90),
+             ("bfoot", [-0.28, 0, -0.14], [-0.4, 0.785], 120, 3, (0.03, -0.097, -0.27, 0.094), 60)],
+            [("fthigh", [0.5, 0, 0], [-1, 0.7], 180, 4.5, (-0.07, -0.12, 0.52, 0.133), 120),
+             ("fshin", [-0.14, 0, -0.24], [-1.2, 0.87], 120, 3, (0.065, -0.09, -0.6, 0.106), 60),
+             ("ffoot", [0.13, 0, -0.18], [-0.5, 0.5], 60, 1.5, (0.045, -0.07, -0.6, 0.07), 30)]):
+        body = torso
+        for name, pos, bend, stiffness, damping, shape, gear in part:
+            body = body.add_body(name=name, pos=pos)
+            body.add_joint(name=name, axis=[0, 1, 0], range=bend, stiffness=[stiffness, 0, 0], damping=[damping, 0, 0])
+            capsule(body, name, *shape)
+            motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, ctrllimited=True, ctrlrange=[-1, 1])
+            motor.set_to_motor()
+            motor.gear[0] = gear
+    return spec
 
 
 # ---------------------------------------------------------------- SAC: twin critics, value network, fixed temperature
@@ -85,16 +128,15 @@ def value_network(n_in):
     return nn.Sequential(nn.Linear(n_in, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 1))
 
 
-def reward(decoder, z, displacement, floor):
+def reward(mean, log_var, displacement, floor):
     """Eq. 6 for one step: log p(displacement | z_single, z_multi = 0) minus its value at the decoder's mean, (B,).
 
-    z (B, 2), displacement (B, 2) in metres, floor in metres. The subtracted term depends on z only: same objective."""
-    mean, log_var = decoder(nn.functional.pad(z, (0, len(decoder.axes) - z.shape[1])), 1)
-    variance = (VARIANCE_SCALE * log_var[:, 0].exp()).clamp(min=floor ** 2)
-    return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * mean[:, 0]) ** 2 / variance).sum(1)
+    mean, log_var (B, 2) of the decoder, displacement (B, 2) in metres, floor in metres. The subtracted term depends on z only: same objective."""
+    variance = (VARIANCE_SCALE * log_var.exp()).clamp(min=floor ** 2)
+    return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * mean) ** 2 / variance).sum(1)
 
 
-def sac_losses(actor, critics, value, target, x, a, x2, r, temperature):
+def sac_losses(actor, critics, value, target, x, a, x2, r):
     """Losses of the actor, the twin critics and the value network (Haarnoja et al. 2018). x, x2 (B, n): state and skill
     before and after the step; a (B, m); r (B,). Every step is followed by another: time limits are not terminal."""
     with torch.no_grad():
@@ -105,93 +147,134 @@ def sac_losses(actor, critics, value, target, x, a, x2, r, temperature):
     q_new = critics(x, a_leaf).min(0).values
     # the trap: a plain backward through q_new would also train the critics to please the actor, and cost another pass
     slope, = torch.autograd.grad(q_new.sum(), a_leaf)
-    actor_loss = (temperature * log_prob - (slope * a_new).sum(1)).mean()
-    v_loss = 0.5 * ((value(x).squeeze(1) - (q_new - temperature * log_prob).detach()) ** 2).mean()
+    actor_loss = (TEMPERATURE * log_prob - (slope * a_new).sum(1)).mean()
+    v_loss = 0.5 * ((value(x).squeeze(1) - (q_new - TEMPERATURE * log_prob).detach()) ** 2).mean()
     return actor_loss, q_loss, v_loss
 
 
 # ---------------------------------------------------------------- measuring
 
+def make_robots(n):
+    return Robots(ant_spec() if ROBOT == "ant" else half_cheetah_spec(), n, THREADS)
+
+
+def grid():
+    """DESIGN's tracking grid. Ant: 5 speeds x DIRECTIONS in [-1.5, 1.5] (a full circle's ends are one direction), (n, 3);
+    Half-Cheetah: 8 speeds in [-1, 1] (Fig 16), (8, 2)."""
+    if ROBOT != "ant":
+        return nn.functional.pad(torch.linspace(-1, 1, 9)[torch.arange(9) != 4][:, None], (0, 1))
+    directions = torch.linspace(-1.5, 1.5, DIRECTIONS) if EXPERIMENT != "ant_full" else 3 * torch.arange(DIRECTIONS) / DIRECTIONS - 1.5
+    return nn.functional.pad(torch.cartesian_prod(torch.linspace(-1.5, 1.5, 5), directions), (0, 1))
+
+
 def grid_run(actor, decoder, deterministic=True):
-    """DESIGN's tracking grid: 5 x 5 (speed, direction) in [-1.5, 1.5], 100 steps from rest at H_z = 100.
-    Returns executed and predicted end points (25, 2) in metres and which robots were ever upside down (25,)."""
-    g = torch.linspace(-1.5, 1.5, 5)
-    z = nn.functional.pad(torch.cartesian_prod(g, g), (0, 1))
-    robots, flipped = Robots(ant_spec(), 25, THREADS), np.zeros(25, bool)
+    """The tracking grid walked for 100 steps from rest at H_z = 100. Returns executed and predicted end points (n, 2 or 1) in metres
+    and which robots were ever upside down (n,)."""
+    z = grid()
+    robots, flipped = make_robots(len(z)), np.zeros(len(z), bool)
     for _ in execute(actor, robots, z, 1, 100, 0.0, deterministic):
-        x, y = robots.qpos[:, 4:6].T  # of the torso's quaternion; its up-vector has height 1 - 2 (x^2 + y^2)
-        flipped |= 1 - 2 * (x ** 2 + y ** 2) < 0
-    return robots.qpos[:, :2].copy(), (100 * STEP_SCALE * predict(decoder, z, 1)[:, 0]).double().numpy(), flipped
+        if ROBOT == "ant":
+            x, y = robots.qpos[:, 4:6].T  # of the torso's quaternion; its up-vector has height 1 - 2 (x^2 + y^2)
+            flipped |= 1 - 2 * (x ** 2 + y ** 2) < 0
+        else:
+            flipped |= np.cos(robots.qpos[:, 2]) < 0
+    return robots.qpos[:, :robots.place].copy(), (100 * STEP_SCALE * predict(decoder, z, 1)[:, 0]).double().numpy(), flipped
 
 
 def tracking(executed, predicted):
-    """Tracking error RMS(executed - predicted) / RMS(predicted); for the five speeds, mean |direction error| in degrees and
-    mean achieved / commanded distance (along the commanded direction)."""
+    """Tracking error RMS(executed - predicted) / RMS(predicted). By speeds (Ant: five; Half-Cheetah: four sizes, both signs averaged), mean
+    |direction error| in degrees (backwards is 180) and mean achieved / commanded distance along the commanded direction."""
     error = np.sqrt(((executed - predicted) ** 2).sum(1).mean() / (predicted ** 2).sum(1).mean())
-    turn = np.angle((executed[:, 0] + 1j * executed[:, 1]) / (predicted[:, 0] + 1j * predicted[:, 1]), deg=True)
     ratio = (executed * predicted).sum(1) / (predicted ** 2).sum(1)
-    return error, abs(turn).reshape(5, 5).mean(1), ratio.reshape(5, 5).mean(1)
+    e, p = (v @ np.array([[1], [1j]])[:v.shape[1]] for v in (executed, predicted))
+    turn = abs(np.angle(e / p, deg=True)[:, 0])
+    if ROBOT != "ant":
+        return error, *((v[3::-1] + v[4:])[:, None].mean(1) / 2 for v in (turn, ratio))
+    return error, turn.reshape(5, -1).mean(1), ratio.reshape(5, -1).mean(1)
+
+
+def by_speed(values):
+    """Mean over the slow, the middle and the fast of what tracking returns by speed."""
+    n = (len(values) - 1) // 2
+    return [float(part.mean()) for part in np.split(values, [n, len(values) - n])]
 
 
 def paths(actor, z, steps, hold, weight):
-    """Executed positions (n, steps * hold + 1, 2) in metres of skills z (n, 3) from rest, mean actions."""
-    robots = Robots(ant_spec(), len(z), THREADS)
-    track = [robots.qpos[:, :2].copy()]
+    """Executed positions (n, steps * hold + 1, 2 or 1) in metres of skills z (n, M) from rest, mean actions."""
+    robots = make_robots(len(z))
+    track = [robots.qpos[:, :robots.place].copy()]
     for _ in execute(actor, robots, z, steps, hold, weight, deterministic=True):
-        track.append(robots.qpos[:, :2].copy())
+        track.append(robots.qpos[:, :robots.place].copy())
     return np.stack(track, 1)
 
 
 def traversal(axis, values):
-    z = torch.zeros(len(values), 3)
+    """Skills with one axis at values, the others at 0; acceleration at z_speed = -1, because it is nothing where speed is."""
+    z = torch.zeros(len(values), 3 if ROBOT == "ant" else 2)
+    if ROBOT != "ant" and axis == 1:
+        z[:, 0] = -1
     z[:, axis] = torch.as_tensor(values, dtype=torch.float32)
     return z
 
 
 def calibrate_relation(decoder, steps=5):
-    """The weight of f_dir(z_dir, z_cur) = z_dir + weight z_cur (Sec. 4.2.2) from the decoder alone: headings of single steps
-    at z_dir + k weight z_cur against headings of step k of the decoder's free run, least squares over a grid of skills
-    whose headings stay where a semicircle is trained (65 degrees). Returns the weight and a function weight -> RMS in degrees."""
+    """The weight of the relation function (Sec. 4.2.2, next_skill) from the decoder alone: single steps at the skills the function
+    visits against the steps of the decoder's free run, least squares over a grid of skills; the Ant's only where the headings
+    stay within what was trained. Returns the weight and a function weight -> RMS miss as a share of the RMS step."""
     g = torch.linspace(-1.5, 1.5, 13)
-    z = torch.cartesian_prod(torch.tensor([0.0, 0.75, 1.5]), g, g)
-    free = torch.view_as_complex(predict(decoder, z, steps))
-    inside = (free.angle().abs() < math.radians(65)).all(1)
+    z = torch.cartesian_prod(torch.tensor([0.0, 0.75, 1.5]), g, g) if ROBOT == "ant" else torch.cartesian_prod(g / 1.5, g)
+    free = predict(decoder, z, steps)
+    inside = torch.ones(len(z), dtype=torch.bool)
+    if EXPERIMENT == "ant_semi":
+        inside = (torch.atan2(free[..., 1], free[..., 0]).abs() < math.radians(65)).all(1)
 
-    def mismatch(weight):
-        relation = torch.view_as_complex(predict(decoder, z, steps, weight))
-        return (relation / free).angle()[inside].rad2deg().square().mean().sqrt().item()
+    def miss(weight):
+        apart = predict(decoder, z, steps, weight)[inside] - free[inside]
+        return (apart.square().mean() / free[inside].square().mean()).sqrt().item()
 
     low, high = -1.0, 1.0
-    while high - low > 1e-4:  # the mismatch has one valley
+    while high - low > 1e-4:  # golden section: the miss has one valley
         a, b = low + 0.382 * (high - low), low + 0.618 * (high - low)
-        low, high = (low, b) if mismatch(a) < mismatch(b) else (a, high)
-    return round((low + high) / 2, 4), mismatch
+        low, high = (low, b) if miss(a) < miss(b) else (a, high)
+    return round((low + high) / 2, 4), miss
 
 
-def draw_fig05(actor, decoder, weight):
-    """Fig 5, WEDIS: predicted (top) and executed (bottom) skills; speed and direction at H_z = 100, T = 1, curvature at 40, 5."""
-    figure, axes = plt.subplots(2, 3, figsize=(9.5, 6.4))
-    for column, (name, axis, steps, hold) in enumerate([("speed", 0, 1, 100), ("direction", 1, 1, 100), ("curvature", 2, 5, 40)]):
-        z = traversal(axis, list(common.LATENT_COLOURS))
+def draw_skills(actor, decoder, weight, name, columns):
+    """Fig 5 (WEDIS), 15, 16: predicted (top) and executed (bottom) skills; a column per (axis, values, T, H_z). In one dimension the
+    latent is on the y axis and time steps have colours."""
+    figure, axes = plt.subplots(2, len(columns), figsize=(3.2 * len(columns), 6.4))
+    for column, (title, axis, values, steps, hold) in enumerate(columns):
+        z = traversal(axis, values)
         predicted = np.pad(hold * STEP_SCALE * predict(decoder, z, steps).numpy().cumsum(1), ((0, 0), (1, 0), (0, 0)))
         executed = paths(actor, z, steps, hold, weight)
-        for i, (value, colour) in enumerate(common.LATENT_COLOURS.items()):
-            axes[0, column].plot(*predicted[i].T, "o-", ms=3, color=colour, label=f"{value:g}")
-            axes[1, column].plot(*executed[i].T, color=colour)
-            axes[1, column].plot(*executed[i, ::hold].T, "o", ms=3, color=colour)
-        axes[0, column].set(title=f"z_{name}, $H_z$ = {hold}, T = {steps}")
+        both = np.concatenate([predicted, executed], 1)
+        if both.shape[2] == 1:
+            for row, points in enumerate((predicted, executed[:, ::hold])):
+                for t, colour in enumerate(plt.get_cmap("plasma")(np.linspace(0, 0.85, steps + 1))):
+                    axes[row, column].plot(points[:, t, 0], values, ".", color=colour, label=f"t = {t}")
+                axes[row, column].set(ylabel=title, xlim=(both.min() - 1, both.max() + 1))
+        else:
+            colours = plt.get_cmap("twilight_shifted" if len(values) > 5 else common.TRAVERSAL_MAP)(np.linspace(0, 0.95, len(values)))
+            for i, value in enumerate(values):
+                colour = common.LATENT_COLOURS.get(value, colours[i])
+                axes[0, column].plot(*predicted[i].T, "o-", ms=3, color=colour, label=f"{value:g}")
+                axes[1, column].plot(*executed[i].T, color=colour)
+                axes[1, column].plot(*executed[i, ::hold].T, "o", ms=3, color=colour)
+            low, high = both.min((0, 1)) - 1, both.max((0, 1)) + 1
+            for ax in axes[:, column]:  # one scale for both rows, or the eye is fooled
+                ax.set(xlim=(low[0], high[0]), ylim=(min(-3, low[1]), max(3, high[1])))
+                ax.set_aspect("equal")
+        axes[0, column].set(title=f"{title}, $H_z$ = {hold}, T = {steps}")
         axes[1, column].set(xlabel="x (m)")
-        both = np.concatenate([predicted.reshape(-1, 2), executed.reshape(-1, 2)])
-        for axis_ in axes[:, column]:  # one scale for both rows, or the eye is fooled
-            axis_.set(xlim=(both[:, 0].min() - 1, both[:, 0].max() + 1), ylim=(min(-3, both[:, 1].min() - 1), max(3, both[:, 1].max() + 1)))
-            axis_.set_aspect("equal")
-    axes[0, 0].set_ylabel("predicted by the decoder\ny (m)")
-    axes[1, 0].set_ylabel("executed by the Ant\ny (m)")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), title="latent", loc="outside right upper")
-    save_figure(figure, OUT, "fig05_skills_wedis" + ("" if EXPERIMENT == "ant_semi" else f"_{EXPERIMENT}"))
+    for row, text in enumerate(("predicted by the decoder", "executed by the robot")):
+        axes[row, 0].set_ylabel(text + "\n" + (axes[row, 0].get_ylabel() or "y (m)"))
+    last = axes[0, -1].get_legend_handles_labels()
+    figure.legend(*last, title="latent" if both.shape[2] == 2 else "time step", loc="outside right upper")
+    save_figure(figure, OUT, name)
 
 
 def draw_learning_curve(curve):
+    """Tracking error and achieved speeds against the minutes of training."""
     figure, (error, returns) = plt.subplots(1, 2, figsize=(8, 3))
     minutes = [row["minutes"] for row in curve]
     error.plot(minutes, [row["tracking_error"] for row in curve], ".-", color=common.BLUE)
@@ -210,15 +293,16 @@ def train(decoder, config):
     """Algorithm 1, policy training. Returns what the policy artifact holds."""
     rng = np.random.default_rng(SEED)
     torch.manual_seed(SEED)
-    robots = Robots(ant_spec(), ROBOTS, THREADS)
-    s_dim, a_dim, z_dim = robots.observe().shape[1], robots.ctrl.shape[1], 2
-    actor, critics = Actor(s_dim, z_dim, a_dim, HIDDEN), Critics(s_dim + z_dim + a_dim)
-    value, target = value_network(s_dim + z_dim), value_network(s_dim + z_dim).requires_grad_(False)
+    robots = make_robots(ROBOTS)
+    s_dim, a_dim, z_dim = robots.observe().shape[1], robots.ctrl.shape[1], len(decoder.axes) - 1
+    actor = Actor(s_dim - EGOCENTRIC, z_dim, a_dim, HIDDEN, decoder if EGOCENTRIC else None)
+    n_in = actor.net[0].in_features
+    critics, value, target = Critics(n_in + a_dim), value_network(n_in), value_network(n_in).requires_grad_(False)
     target.load_state_dict(value.state_dict())
     networks = nn.ModuleList([actor, critics, value])
     optimizer = torch.optim.Adam(networks.parameters(), lr=LEARNING_RATE, fused=True)
 
-    columns = (s_dim, a_dim, s_dim, 2, z_dim)  # s, a, s', displacement, z; one row a step, so that one gather makes a batch
+    columns = (s_dim, a_dim, s_dim, robots.place, z_dim)  # s, a, s', displacement, z; one row a step, so that one gather makes a batch
     replay = torch.zeros(REPLAY, sum(columns))
     z = torch.randn(ROBOTS, z_dim)
     age = rng.integers(0, EPISODE, ROBOTS)  # staggered, or all robots would start anew at once
@@ -228,7 +312,7 @@ def train(decoder, config):
 
     if resumable(OUT, "policy-checkpoint", EXPERIMENT, SEED, RESUME):
         state = load(OUT, "policy-checkpoint", EXPERIMENT, SEED)
-        check_same(state, config, set(config) - {"RESUME", "OUT", "THREADS", "CHECKPOINT", "REPORTS", "UPDATES", "POLISH", "MINUTES"})
+        check_same(state, config, set(config) - {"RESUME", "OUT", "THREADS", "CHECKPOINT", "REPORTS", "UPDATES", "MINUTES"})
         networks.load_state_dict(state["networks"])
         target.load_state_dict(state["target"])
         optimizer.load_state_dict(state["optimizer"])
@@ -249,16 +333,16 @@ def train(decoder, config):
 
     def report():
         error, degrees, ratio = tracking(*grid_run(actor, decoder)[:2])
+        slow, mid, fast = by_speed(ratio)
         curve.append(dict(updates=updates, env_steps=env_steps, minutes=seconds / 60, tracking_error=float(error), reward=r.mean().item(),
-                          direction_deg=float(degrees[2:].mean()), speed_slow=float(ratio[:2].mean()), speed_mid=float(ratio[2]),
-                          speed_fast=float(ratio[3:].mean())))
+                          direction_deg=float(degrees[2:].mean()), speed_slow=slow, speed_mid=mid, speed_fast=fast))
         update_csv(Path(OUT) / "results" / f"learning_curve_{EXPERIMENT}_seed{SEED}.csv", curve, ())
         print(f"{updates:7d} updates {env_steps:8d} steps  tracking error {error:.3f}  direction {degrees[2:].mean():5.1f} deg  speed x "
-              f"{ratio[:2].mean():.2f} {ratio[2]:.2f} {ratio[3:].mean():.2f}  reward {r.mean():6.3f}  floor {floor:.3f}  "
+              f"{slow:.2f} {mid:.2f} {fast:.2f}  reward {r.mean():6.3f}  floor {floor:.3f}  "
               f"{updates / seconds:4.0f} updates/s  {seconds / 60 * (1 / progress - 1):4.0f} min left", flush=True)
 
     def share_done():
-        return seconds / 60 / MINUTES if MINUTES else updates / (UPDATES + POLISH)
+        return seconds / 60 / MINUTES if MINUTES else updates / UPDATES
 
     progress, last_save, interval = share_done(), time.time(), max(1, UPDATES // REPORTS)
     while progress < 1:
@@ -271,7 +355,7 @@ def train(decoder, config):
             a = torch.rand(ROBOTS, a_dim) * 2 - 1
         else:
             with torch.no_grad():
-                a, _ = actor(actor.inputs(s, z))
+                a = actor.act(s, z)
         displacement, failed = robots.step(a.numpy())
         keep = torch.from_numpy(np.flatnonzero(~failed))
         rows = torch.cat([s, a, robots.observe(), displacement, z], 1)[keep]
@@ -287,22 +371,26 @@ def train(decoder, config):
             continue
         if not updates:  # state statistics of the random steps, kept from here on
             first = replay[:env_steps, :s_dim]
+            if EGOCENTRIC:
+                first, *_ = egocentric(first, next(first_step(decoder, replay[:env_steps, -z_dim:])))
             actor.s_mean.copy_(first.mean(0)), actor.s_std.copy_(first.std(0).clamp(min=1e-3))
 
-        # Improve: a few updates
-        for _ in range(UPDATES_PER_STEP):
-            progress = share_done()
-            main = progress * (UPDATES + POLISH) / UPDATES
-            rate, temperature = (min(1, 2 * (1 - main)), TEMPERATURE) if main < 1 else (2 * (1 - progress), TEMPERATURE_END)
-            floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** min(1, max(0, (main - 0.5) / 0.4))
-            for group in optimizer.param_groups:
-                group["lr"] = LEARNING_RATE * max(0, rate)
-            batch = replay[torch.randint(min(env_steps, REPLAY), (BATCH,))]
-            s, a, s2, displacement, skill = batch.split(columns, 1)
-            skill[:int(RELABELLED * BATCH)] = torch.randn(int(RELABELLED * BATCH), z_dim)  # a copy: replay keeps its own
-            with torch.no_grad():
-                r = reward(decoder, skill, displacement, floor)
-            losses = sac_losses(actor, critics, value, target, actor.inputs(s, skill), a, actor.inputs(s2, skill), r, temperature)
+        # Improve: a few updates. What needs no gradient is computed for all of them at once
+        floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** min(1, max(0, (progress - 0.15) / 0.45))
+        for group in optimizer.param_groups:
+            group["lr"] = LEARNING_RATE * min(1, max(0, 2 * (1 - progress)))
+        batch = replay[torch.randint(min(env_steps, REPLAY), (UPDATES_PER_STEP * BATCH,))]
+        s, a, s2, displacement, skill = batch.split(columns, 1)
+        fresh = torch.rand(len(skill)) < RELABELLED
+        skill[fresh] = torch.randn(int(fresh.sum()), z_dim)  # a copy: replay keeps its own
+        with torch.no_grad():
+            step, log_var = first_step(decoder, skill)
+            r = reward(step, log_var, displacement, floor)
+            x, turns = actor.inputs(s, skill, step)
+            x2, _ = actor.inputs(s2, skill, step)
+            a = actor.seen(a, turns)
+        for small in zip(*(v.split(BATCH) for v in (x, a, x2, r))):
+            losses = sac_losses(actor, critics, value, target, *small)
             optimizer.zero_grad()
             sum(losses).backward()  # the three touch disjoint parameters
             optimizer.step()
@@ -331,7 +419,7 @@ if __name__ == "__main__":
     torch.set_num_threads(THREADS)
     decoder_content = load(OUT, "wetvae", DECODER, DECODER_SEED)
     decoder = load_decoder(decoder_content)
-    weight, mismatch = calibrate_relation(decoder)
+    weight, miss = calibrate_relation(decoder)
     if TRAIN:
         if not BATCH <= WARM_UP <= REPLAY or not UPDATES:
             stop(f"--updates must be at least 1 and --warm_up {WARM_UP} must lie between --batch {BATCH} and --replay {REPLAY}")
@@ -340,36 +428,48 @@ if __name__ == "__main__":
     policy = load(OUT, "policy", EXPERIMENT, SEED)
     actor = load_actor(policy)
 
-    print(f"\nrelation function, calibrated: f_dir(z_dir, z_cur) = z_dir {weight:+.3f} z_cur   (the paper, by hand: 0.2 in size)")
-    print(f"  heading of the decoder missed by {mismatch(weight):.1f} deg RMS; with 0.2 by {mismatch(0.2):.1f}, without by {mismatch(0.0):.1f}")
-    z = traversal(2, np.linspace(-1.5, 1.5, 13))
+    names, ant = decoder_content["names"], ROBOT == "ant"
+    print(f"\nrelation function, calibrated: z_{names[1 if ant else 0]} {weight:+.3f} {'' if ant else 'sign(z_speed) '}z_{names[-1]}   "
+          f"(the paper, by hand: {0.2 if ant else 0.1} in size)")
+    print(f"  free run of the decoder missed by {miss(weight):.1%} RMS; with the paper's size by {miss(0.2 if ant else 0.1):.1%}, "
+          f"without by {miss(0.0):.1%}")
+    z = traversal(len(names) - 1, np.linspace(-1.5, 1.5, 13))
     predicted = 40 * STEP_SCALE * predict(decoder, z, 5).numpy().sum(1)
-    for w in (weight, 0.2, 0.0):
-        miss, size = (np.linalg.norm(v, axis=1).mean() for v in (paths(actor, z, 5, 40, w)[:, -1] - predicted, predicted))
-        print(f"  on the Ant (T = 5, H_z = 40): weight {w:.3f} ends {miss:.2f} m from the decoder's curve of {size:.1f} m")
+    for w in (weight, 0.0):
+        away, size = (np.linalg.norm(v, axis=1).mean() for v in (paths(actor, z, 5, 40, w)[:, -1] - predicted, predicted))
+        print(f"  on the robot (T = 5, H_z = 40): weight {w:.3f} ends {away:.2f} m from the decoder's path of {size:.1f} m")
 
     executed, commanded, flipped = grid_run(actor, decoder)
     error, degrees, ratio = tracking(executed, commanded)
     torch.manual_seed(SEED)
     error_sampled, *_ = tracking(*grid_run(actor, decoder, deterministic=False)[:2])
-    names = list(FULL_RANGE)
-    curves = [factors_of(np.diff(paths(actor, traversal(i, np.linspace(-1.5, 1.5, 13)), 5, 40, weight)[:, ::40], axis=1) / (40 * STEP_SCALE))
-              for i in range(3)]
-    C, purity = cross_talk(curves, names)
-    skills = nn.functional.pad(torch.randn(COVERAGE, 2), (0, 1))
-    coverage = len(np.unique(np.floor(paths(actor, skills, 1, EPISODE, 0.0).reshape(-1, 2)), axis=0))
-    print(f"\ntracking error {error:.3f} (mean actions), {error_sampled:.3f} (sampled actions); flips {flipped.sum()} of 25")
-    print("z_speed              -1.5  -0.75      0   0.75    1.5")
+    accelerating = "acceleration" in names
+    profiles = [np.diff(paths(actor, traversal(i, np.linspace(-1.5, 1.5, 25)), 5, 40, weight)[:, ::40], axis=1) / (40 * STEP_SCALE)
+                for i in range(len(names))]
+    C, purity = cross_talk([factors_of(profile, accelerating) for profile in profiles], names, decoder_content["ranges"])
+    skills = nn.functional.pad(torch.randn(COVERAGE, len(names) - 1), (0, 1))
+    coverage = len(np.unique(np.floor(paths(actor, skills, 1, EPISODE, 0.0).reshape(COVERAGE * (EPISODE + 1), -1)), axis=0))
+    print(f"\ntracking error {error:.3f} (mean actions), {error_sampled:.3f} (sampled actions); flips {flipped.sum()} of {len(flipped)}")
+    print("from slow to fast")
     print("direction error deg " + " ".join(f"{d:6.1f}" for d in degrees))
     print("achieved/commanded  " + " ".join(f"{v:6.2f}" for v in ratio))
+    if accelerating:
+        promised = predict(decoder, traversal(1, np.linspace(-1.5, 1.5, 25)), 5).numpy()
+        print(f"accelerating skill: speed profile {np.sqrt(((profiles[1] - promised) ** 2).mean() / (promised ** 2).mean()):.3f} from the prediction")
     print("executed cross-talk, purity: " + "; ".join(f"z_{n} " + " ".join(f"{c:.2f}" for c in row) + f" purity {p:.2f}"
                                                        for n, row, p in zip(names, C, purity)))
     print(f"coverage of {COVERAGE} random skills: {coverage} cells of 1 m")
+    slow, mid, fast = by_speed(ratio)
     update_csv(Path(OUT) / "results" / "policies.csv", [dict(
         experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy["updates"], env_steps=policy["env_steps"],
         train_minutes=policy["seconds"] / 60, tracking_error=error, tracking_error_sampled=error_sampled,
-        direction_error_deg=degrees[2:].mean(), speed_ratio_slow=ratio[:2].mean(), speed_ratio_mid=ratio[2],
-        speed_ratio_fast=ratio[3:].mean(), flips=int(flipped.sum()), purity_speed=purity[0], purity_direction=purity[1],
-        purity_curvature=purity[2], purity_acceleration="", coverage_cells=coverage)], ("experiment", "method", "seed"))
-    draw_fig05(actor, decoder, weight)
+        direction_error_deg=degrees[2:].mean(), speed_ratio_slow=slow, speed_ratio_mid=mid, speed_ratio_fast=fast, flips=int(flipped.sum()),
+        **{f"purity_{n}": dict(zip(names, purity)).get(n, "") for n in ("speed", "direction", "curvature", "acceleration")},
+        coverage_cells=coverage)], ("experiment", "method", "seed"))
+    five, circle = list(common.LATENT_COLOURS), [round(float(v), 3) for v in grid()[:DIRECTIONS, 1]] if ant else []
+    draw_skills(actor, decoder, weight, *{
+        "ant_semi": ("fig05_skills_wedis", [("$z_{speed}$", 0, five, 1, 100), ("$z_{dir}$", 1, five, 1, 100), ("$z_{cur}$", 2, five, 5, 40)]),
+        "ant_full": ("fig15_full_circle", [("$z_{speed}$", 0, five, 1, 100), ("$z_{dir}$", 1, circle, 1, 100)]),
+        "half_cheetah": ("fig16_half_cheetah", [("$z_{speed}$", 0, np.linspace(-1, 1, 9), 6, 20), ("$z_{acc}$", 1, np.linspace(-1, 1, 9), 6, 20)]),
+    }[EXPERIMENT])
     draw_learning_curve(policy["curve"])

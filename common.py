@@ -235,12 +235,16 @@ def bootstrap_interval(values, draws=10_000):
 
 # ---------------------------------------------------------------- weak labels and factors
 
-LABEL_RULES = {  # factor: (number of classes, class from the factors, counted from 0), App. A.1.1
+LABEL_RULES = {  # weak label: (number of classes, class from the factors, counted from 0), App. A.1.1 and A.3.1
     "speed": (4, lambda f: np.floor(f["speed"] / 0.25)),
     "direction": (4, lambda f: np.floor((math.pi / 2 - f["direction"]) / (math.pi / 4))),  # from +90 degrees downwards
     "curvature": (3, lambda f: np.select([f["curvature"] > 0, f["curvature"] < 0], [1, 2], 0)),  # straight, left, right
+    "angle": (4, lambda f: np.floor(f["direction"] % (2 * math.pi) / (math.pi / 2))),  # full circle, quarters from 0 degrees
+    "x": (4, lambda f: np.floor((f["speed"] * np.cos(f["direction"]) + 1) / 0.5)),
+    "y": (4, lambda f: np.floor((f["speed"] * np.sin(f["direction"]) + 1) / 0.5)),
+    "velocity": (4, lambda f: np.floor((f["speed"] + 1) / 0.5)),  # speed with a sign, one dimension
+    "acceleration": (3, lambda f: np.select([f["acceleration"] > 0, f["acceleration"] < 0], [1, 2], 0)),  # none, up, down
 }
-FULL_RANGE = {"speed": 1.0, "direction": math.pi, "curvature": math.pi / 3}  # of Table 1, for the cross-talk matrix
 
 
 def weak_labels(factors, names):
@@ -249,20 +253,37 @@ def weak_labels(factors, names):
     return np.stack([np.clip(rule(factors), 0, classes - 1).astype(np.int64) for classes, rule in rules], axis=1)
 
 
-def factors_of(displacement):
-    """Factors of trajectories given by their transitions. displacement (N, T, 2) -> dict of (N,): speed in the unit of
-    the displacement, direction of the first transition in radians, curvature in radians per transition."""
-    heading = np.arctan2(displacement[..., 1], displacement[..., 0])
-    turn = (np.diff(heading, axis=1) + math.pi) % (2 * math.pi) - math.pi
-    return dict(speed=np.linalg.norm(displacement, axis=-1).mean(1), direction=heading[:, 0],
-                curvature=turn.mean(1) if turn.shape[1] else np.zeros(len(turn)))
+def factors_of(displacement, accelerating=False):
+    """Factors of trajectories given by their transitions. displacement (N, T, 2 or 1) -> dict of (N,): speed in the unit of the
+    displacement (in one dimension with its sign), direction of the first transition in radians, curvature in radians per
+    transition, x and y of a mean transition. accelerating: speed is that of the first transition, and acceleration is what a
+    transition gains, over the speed (but never over less than 0.1, or standing still would be noise)."""
+    one_d, T = displacement.shape[2] == 1, displacement.shape[1]
+    size = displacement[..., 0] if one_d else np.linalg.norm(displacement, axis=-1)
+    found = dict(speed=size[:, 0] if accelerating else size.mean(1))
+    if accelerating and T > 1:
+        found["acceleration"] = (size[:, -1] - size[:, 0]) / (T - 1) * np.sign(size[:, 0]) / np.maximum(abs(size[:, 0]), 0.1)
+    if not one_d:
+        heading = np.arctan2(displacement[..., 1], displacement[..., 0])
+        turn = (np.diff(heading, axis=1) + math.pi) % (2 * math.pi) - math.pi
+        found |= dict(direction=heading[:, 0], curvature=turn.mean(1) if T > 1 else np.zeros(len(turn)),
+                      x=displacement[..., 0].mean(1), y=displacement[..., 1].mean(1))
+    return found
 
 
-def cross_talk(curves, names):
+def spread(values, name):
+    """How far a factor (n,) ranges; of directions, which close in a circle, all of it but the largest gap."""
+    if name != "direction":
+        return np.ptp(values)
+    angles = np.sort(values % (2 * math.pi))
+    return 2 * math.pi - np.diff(angles, append=angles[0] + 2 * math.pi).max()
+
+
+def cross_talk(curves, names, ranges):
     """C[i, j] = range of factor j while axis i is traversed / full range of factor j; purity_i = C[i, i] / sum_j C[i, j].
 
-    curves: one dict of factors per axis, in the order of names. Returns C (M, M), purity (M,). No encoder is involved."""
-    C = np.array([[np.ptp(curve[name]) / FULL_RANGE[name] for name in names] for curve in curves])
+    curves: one dict of factors per axis, in the order of names; ranges: the data's. Returns C (M, M), purity (M,). No encoder."""
+    C = np.array([[spread(curve[name], name) / full for name, full in zip(names, ranges)] for curve in curves])
     return C, np.diag(C) / C.sum(1)
 
 
@@ -275,44 +296,65 @@ class Decoder(nn.Module):
     z is not needed and stays entangled. So the decoder never sees the truth, in training either.
     """
 
-    def __init__(self, z_dim, x_dim=2, hidden=64):
+    def __init__(self, z_dim, x_dim=2, hidden=64, circle=False):
         super().__init__()
-        self.cell = nn.LSTMCell(x_dim + z_dim, hidden)
+        self.cell = nn.LSTMCell(x_dim + z_dim + circle, hidden)
         self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2 * x_dim))
-        self.register_buffer("axes", torch.eye(z_dim))  # canonical z -> latent of training: a signed permutation
+        self.register_buffer("axes", torch.eye(z_dim, z_dim + circle))  # canonical z -> latents of training: a signed permutation
+        self.register_buffer("circle", torch.zeros(3 * circle))  # which axis the first two latents are the circle of, sign, offset
 
-    def forward(self, z, steps):
-        """z (B, M) -> mean and log-variance of the displacements, (B, steps, x_dim) each, in trajectory units."""
-        z, state, outputs = z @ self.axes, None, []
-        mean = z.new_zeros(len(z), self.cell.input_size - z.shape[1])
+    def latents(self, z):
+        """Canonical z (B, M) -> latents of training (B, M), or (B, M + 1) where direction is a point on a circle, z_dir = 1 a third of it."""
+        out = z @ self.axes
+        if len(self.circle):
+            angle = z[:, int(self.circle[0])] * self.circle[1] * (2 * math.pi / 3) + self.circle[2]
+            out = torch.cat([angle.cos()[:, None], angle.sin()[:, None], out[:, 2:]], 1)
+        return out
+
+    def unroll(self, latents, steps):
+        """Latents of training (B, L) -> mean and log-variance of the displacements, (B, steps, x_dim) each, in trajectory units."""
+        state, outputs = None, []
+        mean = latents.new_zeros(len(latents), self.cell.input_size - latents.shape[1])
         for _ in range(steps):
-            state = self.cell(torch.cat([mean, z], 1), state)
+            state = self.cell(torch.cat([mean, latents], 1), state)
             mean, log_var = self.head(state[0]).chunk(2, 1)
             outputs.append(torch.stack([mean, log_var]))
         return torch.stack(outputs, 2).unbind(0)
 
+    def forward(self, z, steps):
+        """Canonical z (B, M) -> as unroll."""
+        return self.unroll(self.latents(z), steps)
+
 
 def load_decoder(content):
     state = content["decoder"]
-    decoder = Decoder(len(state["axes"]), len(state["head.2.bias"]) // 2, len(state["head.0.bias"]))
+    decoder = Decoder(len(state["axes"]), len(state["head.2.bias"]) // 2, len(state["head.0.bias"]), len(state["circle"]) > 0)
     decoder.load_state_dict(state)
     return decoder.requires_grad_(False)
 
 
-def gaussian_log_prob(x, mean, log_var):
-    """log N(x; mean, exp(log_var)), elementwise."""
-    return -0.5 * ((x - mean) ** 2 * torch.exp(-log_var) + log_var + math.log(2 * math.pi))
-
-
 def next_skill(z, weight):
-    """The relation functions of the Ant, Sec. 6.1.2: f_speed is the identity, f_dir(z_dir, z_cur) = z_dir + weight z_cur.
-    z (..., 3) = (speed, direction, curvature). The paper tunes the weight by hand; 03 calibrates it from the decoder."""
+    """The relation functions, Sec. 6.1.2 and A.3.2. Ant, z (..., 3) = (speed, direction, curvature): f_dir(z_dir, z_cur) = z_dir + weight
+    z_cur; Half-Cheetah, z (..., 2) = (speed, acceleration): f_speed(z_speed, z_acc) = z_speed + weight sign(z_speed) z_acc. The
+    paper tunes the weight by hand; 03 calibrates it from the decoder."""
+    if z.shape[-1] == 2:
+        return torch.stack([z[..., 0] + weight * z[..., 0].sign() * z[..., 1], z[..., 1]], -1)
     return torch.stack([z[..., 0], z[..., 1] + weight * z[..., 2], z[..., 2]], -1)
+
+
+def single(z):
+    """z_single: speed and direction of (speed, direction, curvature), speed of (speed, acceleration)."""
+    return z[..., :z.shape[-1] - 1]
+
+
+def first_step(decoder, z):
+    """Mean and log-variance (B, x_dim) of the decoder's first step for z_single = z (B, m), z_multi = 0."""
+    return (v[:, 0] for v in decoder(nn.functional.pad(z, (0, len(decoder.axes) - z.shape[1])), 1))
 
 
 @torch.no_grad()
 def predict(decoder, z, steps, weight=None):
-    """Displacements (B, T, 2), in trajectory units, that skills z (B, 3) promise: the decoder's means.
+    """Displacements (B, T, x_dim), in trajectory units, that skills z (B, M) promise: the decoder's means.
 
     weight None: `steps` free steps of the decoder, as in the paper. Else its first step, `steps` times, with z moved by
     the relation function in between: exactly what the policy will be told to do."""
@@ -321,9 +363,8 @@ def predict(decoder, z, steps, weight=None):
     skills = [z]
     for _ in range(steps - 1):
         skills.append(next_skill(skills[-1], weight))
-    z = torch.stack(skills, 1)
-    z[..., 2:] = 0  # z_multi = 0: a single step is conditioned on z_single
-    return decoder(z.flatten(0, 1), 1)[0].view(len(z), steps, -1)
+    mean, _ = first_step(decoder, single(torch.stack(skills, 1)).flatten(0, 1))
+    return mean.view(len(z), steps, -1)
 
 
 # ---------------------------------------------------------------- the robot
@@ -371,56 +412,99 @@ def ant_spec():
                                       ctrllimited=True, ctrlrange=[-1, 1])
             motor.set_to_motor()
             motor.gear[0] = 150
+    spec.add_key(name="rest", qpos=REST)
     return spec
 
 
 class Robots:
-    """n robots of one model that step together on threads; equal to a loop over mj_step (mujoco.batch)."""
+    """n robots of one model that step together on threads; equal to a loop over mj_step (mujoco.batch). A robot that is free to move
+    has two coordinates of place, x and y; one on a rail only x."""
 
     def __init__(self, spec, n, threads=2):
-        self.batch = Batch(spec.compile(), n, threads)
+        model = spec.compile()
+        self.batch, self.place = Batch(model, n, threads), 2 if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE else 1
+        self.rest = model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
         self.qpos, self.qvel, self.ctrl, self.time = map(self.batch.bind, ("qpos", "qvel", "ctrl", "time"))  # live views
         self.reset(np.arange(n))
 
     def reset(self, ids, rng=None, noise=0.1):
         """Put robots ids at the origin in the rest pose; with rng add U(-noise, noise) to positions, N(0, noise) to velocities."""
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)  # also clears the solver's warm start
-        self.qpos[ids], self.time[ids] = REST, 1.0  # clocks start at 1 s, MuJoCo's own reset of an unstable simulation at 0
+        self.qpos[ids], self.time[ids] = self.rest, 1.0  # clocks start at 1 s, MuJoCo's own reset of an unstable simulation at 0
         if rng is not None:
             self.qpos[ids] += rng.uniform(-noise, noise, (len(ids), self.qpos.shape[1]))
             self.qvel[ids] = rng.normal(0, noise, (len(ids), self.qvel.shape[1]))
 
     def observe(self):
-        """The policy's state (n, 27): qpos without x and y, qvel. Float32."""
-        return torch.from_numpy(np.concatenate([self.qpos[:, 2:], self.qvel], 1, dtype=np.float32, casting="same_kind"))
+        """The policy's state, Ant (n, 27), Half-Cheetah (n, 17): qpos without the place, qvel. Float32."""
+        return torch.from_numpy(np.concatenate([self.qpos[:, self.place:], self.qvel], 1, dtype=np.float32, casting="same_kind"))
 
     def step(self, action):
-        """One environment step of 0.05 s. action (n, 8) in [-1, 1]. Returns displacement (n, 2) in metres and which
+        """One environment step of 0.05 s. action (n, 8) in [-1, 1]. Returns displacement (n, 2 or 1) in metres and which
         simulations MuJoCo found unstable (n,): it has reset those, so that their displacement means nothing."""
-        before, clock = self.qpos[:, :2].copy(), self.time.copy()
+        before, clock = self.qpos[:, :self.place].copy(), self.time.copy()
         self.ctrl[:] = action
         self.batch.step(nstep=FRAME_SKIP)
         unstable = (self.time <= clock).reshape(-1) | ~np.isfinite(self.qpos).all(1)
-        return torch.from_numpy((self.qpos[:, :2] - before).astype(np.float32)), unstable
+        return torch.from_numpy((self.qpos[:, :self.place] - before).astype(np.float32)), unstable
 
 
 # ---------------------------------------------------------------- the skill policy
 
-class Actor(nn.Module):
-    """pi_psi(a | s, z_single): a Gaussian squashed by tanh, Sec. 4.2.2. Normalises the state by fixed statistics."""
+ANKLES = torch.tensor([1.0, -1.0, -1.0, 1.0])  # legs 1 2 3 4: which way a bent ankle counts
 
-    def __init__(self, s_dim, z_dim, a_dim, hidden):
+
+def turn_legs(x, turns, signs):
+    """Hip and ankle values of four legs (B, 8), leg by leg counter-clockwise, as seen from a frame turned by `turns` quarter turns
+    (B,). signs (4,): of the ankles, in x's order of legs; frames turned back have all of them bent the positive way."""
+    legs = x.view(-1, 4, 2)[torch.arange(len(x))[:, None], (torch.arange(4) + turns[:, None]) % 4]
+    order = signs[(torch.arange(4) + turns[:, None]) % 4] * signs
+    return torch.stack([legs[..., 0], legs[..., 1] * order], -1).flatten(1)
+
+
+def egocentric(s, step):
+    """The world as the Ant sees it. s (B, 27) of Robots.observe, step (B, 2): the displacement the skill asks for.
+
+    Physics knows no north, and the Ant looks the same after a quarter turn: everything is turned into the frame of the torso's
+    heading, and that by quarter turns until the wanted step points ahead within 45 degrees. Returns the state (B, 26), the
+    step (B, 2) and the quarter turns (B,). What is learnt for one direction is so learnt for all."""
+    alpha, beta = torch.complex(s[:, 1], s[:, 4]), torch.complex(s[:, 2], s[:, 3])  # quaternion = alpha + beta i: heading, tilt
+    ahead = torch.polar(torch.ones(len(s)), -2 * alpha.angle())  # turns the world until the torso faces along x
+    turns = (torch.angle(torch.view_as_complex(step) * ahead) / (math.pi / 2)).round()
+    back = torch.polar(torch.ones(len(s)), -turns * (math.pi / 2))
+    turns = turns.long()
+    plane = torch.stack([torch.view_as_complex(step) * ahead * back, beta * torch.polar(torch.ones(len(s)), -alpha.angle()) * back,
+                         torch.complex(s[:, 13], s[:, 14]) * ahead * back,     # velocity: of the world
+                         torch.complex(s[:, 16], s[:, 17]) * back], 1)         # angular velocity: of the torso
+    step, *plane = torch.view_as_real(plane).unbind(1)
+    state = torch.cat([s[:, :1], alpha.abs()[:, None], *plane, s[:, 15:16], s[:, 18:19],
+                       turn_legs(s[:, 5:13], turns, ANKLES), turn_legs(s[:, 19:27], turns, ANKLES)], 1)
+    return state, step, turns
+
+
+class Actor(nn.Module):
+    """pi_psi(a | s, z_single): a Gaussian squashed by tanh, Sec. 4.2.2. Normalises the state by fixed statistics. With a decoder it is
+    egocentric: it sees the step the decoder predicts for z instead of z, from the torso's heading."""
+
+    def __init__(self, s_dim, z_dim, a_dim, hidden, decoder=None):
         super().__init__()
+        self.decoder = decoder
         self.net = nn.Sequential(nn.Linear(s_dim + z_dim, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
                                  nn.Linear(hidden, 2 * a_dim))
         self.register_buffer("s_mean", torch.zeros(s_dim))
         self.register_buffer("s_std", torch.ones(s_dim))
 
-    def inputs(self, s, z):
-        return torch.cat([((s - self.s_mean) / self.s_std).clamp(-10, 10), z], -1)
+    def inputs(self, s, z, step=None):
+        """s (B, n), z (B, m), step: the decoder's mean for z if it is known -> what the networks see (B, s_dim + z_dim) and by how
+        many quarter turns the legs are counted on (B,)."""
+        turns = torch.zeros(len(s), dtype=torch.int64)
+        if self.decoder is not None:
+            step = next(first_step(self.decoder, z)) if step is None else step
+            s, z, turns = egocentric(s, step)
+        return torch.cat([((s - self.s_mean) / self.s_std).clamp(-10, 10), z], -1), turns
 
     def forward(self, x, deterministic=False):
-        """x = inputs(s, z) (B, s_dim + z_dim) -> action (B, a_dim) in (-1, 1), log-probability (B,)."""
+        """x of inputs -> action (B, a_dim) in (-1, 1), log-probability (B,)."""
         mean, log_std = self.net(x).chunk(2, -1)
         log_std = log_std.clamp(-5, 2)
         noise = torch.zeros_like(mean) if deterministic else torch.randn_like(mean)
@@ -430,11 +514,23 @@ class Actor(nn.Module):
         log_prob = log_prob - 2 * (math.log(2) - u - nn.functional.softplus(-2 * u))
         return torch.tanh(u), log_prob.sum(-1)
 
+    @torch.no_grad()
+    def act(self, s, z, deterministic=False):
+        """The action (B, a_dim) for the robot's own motors."""
+        x, turns = self.inputs(s, z)
+        action, _ = self(x, deterministic)
+        return self.seen(action, -turns)
+
+    def seen(self, action, turns):
+        """Actions with legs counted on by quarter turns: of the motors -> of the networks; with -turns back again."""
+        return action if self.decoder is None else turn_legs(action, turns, ANKLES.roll(1))  # motors begin with leg 4
+
 
 def load_actor(content):
     state = content["actor"]
     a_dim, hidden, s_dim = len(state["net.4.bias"]) // 2, len(state["net.0.bias"]), len(state["s_mean"])
-    actor = Actor(s_dim, state["net.0.weight"].shape[1] - s_dim, a_dim, hidden)
+    decoder = load_decoder(content) if "decoder.axes" in state else None
+    actor = Actor(s_dim, state["net.0.weight"].shape[1] - s_dim, a_dim, hidden, decoder)
     actor.load_state_dict(state)
     return actor.requires_grad_(False)
 
@@ -445,8 +541,7 @@ def execute(actor, robots, z, steps, hold, weight, deterministic):
     z (n, 3). Yields after each environment step (for contacts, frames and stopping); the robots hold the state."""
     for _ in range(steps):
         for _ in range(hold):
-            action, _ = actor(actor.inputs(robots.observe(), z[:, :2]), deterministic)
-            yield robots.step(action.numpy())
+            yield robots.step(actor.act(robots.observe(), single(z), deterministic).numpy())
         z = next_skill(z, weight)
 
 

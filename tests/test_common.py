@@ -122,7 +122,7 @@ def test_labels_at_the_ends_of_the_ranges():
 def test_factors_are_read_back_from_trajectories(s1):
     rng = np.random.default_rng(0)
     speed, direction, curvature = rng.uniform(0.1, 1, 100), rng.uniform(-3, 3, 100), rng.uniform(-0.5, 0.5, 100)
-    found = common.factors_of(np.diff(s1.make_trajectories(speed, direction, curvature, 5), axis=1))
+    found = common.factors_of(np.diff(s1.make_trajectories(speed, direction, curvature, length=5), axis=1))
     for name, true in dict(speed=speed, direction=direction, curvature=curvature).items():
         np.testing.assert_allclose(found[name], true, atol=1e-12)
 
@@ -130,7 +130,7 @@ def test_factors_are_read_back_from_trajectories(s1):
 def test_cross_talk_and_purity_by_hand():
     curves = [dict(speed=np.array([0, 0.8]), direction=np.array([0, math.pi * 0.2])),
               dict(speed=np.array([0.3, 0.3]), direction=np.array([-math.pi / 2, math.pi / 2]))]
-    C, purity = common.cross_talk(curves, ["speed", "direction"])
+    C, purity = common.cross_talk(curves, ["speed", "direction"], [1, math.pi])
     np.testing.assert_allclose(C, [[0.8, 0.2], [0, 1]])
     np.testing.assert_allclose(purity, [0.8, 1])
 
@@ -159,9 +159,9 @@ def test_canonical_axes_permute_and_flip():
     torch.testing.assert_close(decoder(z, 2)[0], plain)
 
 
-def test_gaussian_log_prob_is_torchs():
+def test_gaussian_log_prob_is_torchs(s2):
     x, mean, log_var = torch.randn(3, 50, 2)
-    torch.testing.assert_close(common.gaussian_log_prob(x, mean, log_var), D.Normal(mean, (0.5 * log_var).exp()).log_prob(x))
+    torch.testing.assert_close(s2.gaussian_log_prob(x, mean, log_var), D.Normal(mean, (0.5 * log_var).exp()).log_prob(x))
 
 
 def test_prediction_under_the_relation_function_is_a_chain_of_first_steps():
@@ -177,7 +177,7 @@ def test_prediction_under_the_relation_function_is_a_chain_of_first_steps():
 def test_actor_log_probability_is_torchs():
     torch.manual_seed(0)
     actor = common.Actor(5, 2, 3, 32)
-    x = actor.inputs(torch.randn(200, 5), torch.randn(200, 2))
+    x, _ = actor.inputs(torch.randn(200, 5), torch.randn(200, 2))
     action, log_prob = actor(x)
     mean, log_std = actor.net(x).chunk(2, 1)
     oracle = D.TransformedDistribution(D.Normal(mean, log_std.clamp(-5, 2).exp()), D.TanhTransform(cache_size=1))

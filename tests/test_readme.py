@@ -17,18 +17,37 @@ def num(text, form):
 def tables():
     """Markdown of each table, from the CSV files alone."""
     results = {name: common.read_csv(ROOT / "results" / f"{name}.csv") for name in ("wetvae", "policies", "mazes")}
-    wetvae = ["| model | axis | \\|corr\\| | purity | decoded range over z in [-1.5, 1.5] | MIG | SAP | seed |",
-              "|---|---|---|---|---|---|---|---|"]
+    head = "| {} | axis | \\|corr\\| | purity | decoded range over z in [-1.5, 1.5] | MIG | SAP | seed |"
+    wetvae, others = ([head.format(name), "|---" * 8 + "|"] for name in ("model", "experiment, labels, β, γ"))
     for r in results["wetvae"]:
-        unit = "" if r["factor"] == "speed" else "°"
-        wetvae.append(f"| {'trajectory VAE' if r['labels'] == 'none' else 'WET-VAE'} | {r['factor']} | {num(r['abs_corr'], '.2f')} | "
-                      f"{num(r['purity'], '.2f')} | {num(r['range_low'], '.2f')}{unit} .. {num(r['range_high'], '.2f')}{unit} | "
-                      f"{num(r['mig'], '.2f')} | {num(r['sap'], '.2f')} | {r['seed']} |")
+        if r["experiment"] in ("seeds", "full") and r["seed"] != "0" or r["experiment"] == "seeds":
+            continue
+        unit = "°" if r["factor"] in ("direction", "curvature") else ""
+        name = "trajectory VAE" if r["labels"] == "none" else "WET-VAE"
+        if r["experiment"] != "main":
+            name = f"{r['experiment']}, {r['labels']}, {num(r['beta'], 'g')}, {num(r['gamma'], 'g')}"
+        (wetvae if r["experiment"] == "main" else others).append(
+            f"| {name} | {r['factor']} | {num(r['abs_corr'], '.2f')} | {num(r['purity'], '.2f')} | "
+            f"{num(r['range_low'], '.2f')}{unit} .. {num(r['range_high'], '.2f')}{unit} | {num(r['mig'], '.2f')} | "
+            f"{num(r['sap'], '.2f')} | {r['seed']} |")
+    seeds = ["| experiment, model | axis | mean purity | 95 % interval | worst (seed) | mean \\|corr\\| | largest empty angle: mean, worst "
+             "| n |", "|---" * 8 + "|"]
+    groups = {}
+    for r in results["wetvae"]:
+        if r["experiment"] in ("seeds", "full"):
+            groups.setdefault((r["experiment"], r["labels"], r["factor"]), []).append(r)
+    for (experiment, labels, factor), rows in groups.items():
+        purity, corr, gaps = (np.array([float(r[k]) for r in rows if r[k]]) for k in ("purity", "abs_corr", "largest_gap_deg"))
+        low, high = common.bootstrap_interval(purity)
+        name = {"none": "trajectory VAE", "circle": "circle"}.get(labels, "Gaussian axis" if experiment == "full" else "WET-VAE")
+        empty = f"{gaps.mean():.1f}°, {gaps.max():.1f}°" if len(gaps) else "–"
+        seeds.append(f"| {experiment}, {name} | {factor} | {purity.mean():.3f} | {low:.3f} .. {high:.3f} | {purity.min():.3f} "
+                     f"({rows[purity.argmin()]['seed']}) | {corr.mean():.2f} | {empty} | {len(rows)} |")
     policies = ["| policy | seed | updates | minutes | tracking error, mean actions | sampled | direction error | speed ratio slow / middle / fast "
-                "| flips of 25 | executed purity speed / direction / curvature |", "|---|---|---|---|---|---|---|---|---|---|"]
+                "| flips | executed purity speed / direction / curvature / acceleration |", "|---|---|---|---|---|---|---|---|---|---|"]
     for r in results["policies"]:
         ratios = " / ".join(num(r["speed_ratio_" + speed], ".2f") for speed in ("slow", "mid", "fast"))
-        purity = " / ".join(num(r["purity_" + name], ".2f") for name in ("speed", "direction", "curvature"))
+        purity = " / ".join(num(r[k], ".2f") if r[k] else "–" for k in r if k.startswith("purity_"))
         policies.append(f"| {r['experiment']} | {r['seed']} | {r['updates']} | {num(r['train_minutes'], '.0f')} | "
                         f"{num(r['tracking_error'], '.3f')} | "
                         f"{num(r['tracking_error_sampled'], '.3f')} | {num(r['direction_error_deg'], '.1f')}° | "
@@ -37,14 +56,14 @@ def tables():
     key = lambda r: (r["maze"], r["objective"], r["reward"], r["prediction"], r["seed"])  # noqa: E731
     ordered = sorted(results["mazes"], key=lambda r: (r["maze"], r["objective"], r["reward"], r["prediction"] == "decoder", r["seed"]))
     mazes = stage.HEADER.split("\n") + [stage.summary(list(rows)) for _, rows in groupby(ordered, key)]
-    return dict(wetvae=wetvae, policies=policies, mazes=mazes)
+    return dict(wetvae=wetvae, others=others, seeds=seeds, policies=policies, mazes=mazes)
 
 
 def between(name):
     return re.compile(rf"(<!-- table {name} -->\n)(.*?)(<!-- end -->)", re.S)
 
 
-@pytest.mark.parametrize("name", ["wetvae", "policies", "mazes"])
+@pytest.mark.parametrize("name", ["wetvae", "others", "seeds", "policies", "mazes"])
 def test_tables_are_those_of_the_results(name):
     assert between(name).search(README.read_text())[2].strip().split("\n") == tables()[name]
 
@@ -75,9 +94,10 @@ def test_pretrained_policy_still_tracks_as_its_row_says(s3, tmp_path):
 
 
 def test_pretrained_decoder_has_the_purity_its_row_says(s2, tmp_path):
-    decoder = common.load_decoder(common.load(tmp_path, "wetvae", "main", 0))
-    names = list(common.FULL_RANGE)
-    _, purity = common.cross_talk([common.factors_of(s2.traverse(decoder, i, np.linspace(-1.5, 1.5, 61), 5)) for i in range(3)], names)
+    content = common.load(tmp_path, "wetvae", "main", 0)
+    decoder, names = common.load_decoder(content), content["names"]
+    curves = [common.factors_of(s2.traverse(decoder, i, np.linspace(-1.5, 1.5, 61), 5)) for i in range(3)]
+    _, purity = common.cross_talk(curves, names, content["ranges"])
     rows = {r["factor"]: float(r["purity"]) for r in common.read_csv(ROOT / "results/wetvae.csv")
             if (r["experiment"], r["seed"]) == ("main", "0") and r["labels"] != "none"}
     np.testing.assert_allclose(purity, [rows[name] for name in names], atol=1e-3)
