@@ -57,6 +57,7 @@ VARIANCE_SCALE = 0.05    # decoder variance -> square metres, App. A.1.3: 1/20
 FLOOR_START = 0.04       # metres, least standard deviation of the reward: a sharp one makes standing still a trap
 FLOOR_END = 0.01         # shrinks to this between 0.15 and 0.6 of the updates: teaches the slow skills
 
+TRAVERSAL = 25           # skills on each axis at which executed purity and the relation function are measured
 COVERAGE = 200           # random skills whose visited cells of 1 m are counted at the end
 
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
@@ -433,7 +434,8 @@ if __name__ == "__main__":
           f"(the paper, by hand: {0.2 if ant else 0.1} in size)")
     print(f"  free run of the decoder missed by {miss(weight):.1%} RMS; with the paper's size by {miss(0.2 if ant else 0.1):.1%}, "
           f"without by {miss(0.0):.1%}")
-    z = traversal(len(names) - 1, np.linspace(-1.5, 1.5, 13))
+    values = np.linspace(-1.5, 1.5, TRAVERSAL)
+    z = traversal(len(names) - 1, values)
     predicted = 40 * STEP_SCALE * predict(decoder, z, 5).numpy().sum(1)
     for w in (weight, 0.0):
         away, size = (np.linalg.norm(v, axis=1).mean() for v in (paths(actor, z, 5, 40, w)[:, -1] - predicted, predicted))
@@ -444,7 +446,7 @@ if __name__ == "__main__":
     torch.manual_seed(SEED)
     error_sampled, *_ = tracking(*grid_run(actor, decoder, deterministic=False)[:2])
     accelerating = "acceleration" in names
-    profiles = [np.diff(paths(actor, traversal(i, np.linspace(-1.5, 1.5, 25)), 5, 40, weight)[:, ::40], axis=1) / (40 * STEP_SCALE)
+    profiles = [np.diff(paths(actor, traversal(i, values), 5, 40, weight)[:, ::40], axis=1) / (40 * STEP_SCALE)
                 for i in range(len(names))]
     C, purity = cross_talk([factors_of(profile, accelerating) for profile in profiles], names, decoder_content["ranges"])
     skills = nn.functional.pad(torch.randn(COVERAGE, len(names) - 1), (0, 1))
@@ -454,7 +456,7 @@ if __name__ == "__main__":
     print("direction error deg " + " ".join(f"{d:6.1f}" for d in degrees))
     print("achieved/commanded  " + " ".join(f"{v:6.2f}" for v in ratio))
     if accelerating:
-        promised = predict(decoder, traversal(1, np.linspace(-1.5, 1.5, 25)), 5).numpy()
+        promised = predict(decoder, traversal(1, values), 5).numpy()
         print(f"accelerating skill: speed profile {np.sqrt(((profiles[1] - promised) ** 2).mean() / (promised ** 2).mean()):.3f} from the prediction")
     print("executed cross-talk, purity: " + "; ".join(f"z_{n} " + " ".join(f"{c:.2f}" for c in row) + f" purity {p:.2f}"
                                                        for n, row, p in zip(names, C, purity)))

@@ -1,5 +1,6 @@
 """Loads the numbered scripts as modules (their names are no identifiers) and runs them as a user would."""
 import importlib.util
+import json
 import os
 import subprocess
 import sys
@@ -28,3 +29,62 @@ def cli(name, *flags, **env):
     """Run a script from the command line in a fresh process; returns the completed process with its text."""
     return subprocess.run([sys.executable, str(ROOT / f"{name}.py"), *map(str, flags)], capture_output=True, text=True,
                           env=os.environ | env, timeout=240)
+
+
+SERVER = """
+import json, os, runpy, signal, sys
+import common, torch._dynamo  # all that a script imports, and what its first optimizer imports
+for line in sys.stdin:
+    if not line.strip():  # wait for the last child
+        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+        continue
+    argv, *streams = json.loads(line)
+    child = os.fork()
+    if not child:
+        signal.alarm(3600)  # nothing may hang, however busy the machine
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores Ctrl-C
+        for number, path in enumerate(streams, 1):
+            os.dup2(os.open(path, os.O_WRONLY), number)
+        sys.stdout.reconfigure(line_buffering=True)
+        sys.argv = argv
+        runpy.run_path(argv[0], run_name="__main__")
+        sys.exit()
+    print(child, flush=True)
+"""
+
+
+class Fork:
+    """Runs a script like cli, but forked from a fresh Python that has imported torch, mujoco and matplotlib and done nothing else: a
+    process of its own, to be interrupted and killed, without the seconds that the imports take. One at a time."""
+
+    def __init__(self, folder):
+        self.streams = [folder / "stdout", folder / "stderr"]
+        self.server = subprocess.Popen([sys.executable, "-c", SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+                                       env=os.environ | dict(PYTHONPATH=str(ROOT)))
+
+    def start(self, name, *flags):
+        for path in self.streams:
+            path.write_text("")
+        argv = [str(ROOT / f"{name}.py"), *map(str, flags)]
+        print(json.dumps([argv, *map(str, self.streams)]), file=self.server.stdin, flush=True)
+        self.pid = int(self.server.stdout.readline())
+
+    def end(self, number=0):
+        """Send a signal, or none, and wait for the end; returns what cli returns."""
+        os.kill(self.pid, number)
+        print(file=self.server.stdin, flush=True)
+        return subprocess.CompletedProcess((), int(self.server.stdout.readline()), *(path.read_text() for path in self.streams))
+
+    def __call__(self, name, *flags):
+        self.start(name, *flags)
+        return self.end()
+
+    def close(self):
+        self.server.communicate()  # its stdin ends, and so does it
+
+
+@pytest.fixture(scope="session")
+def fork(tmp_path_factory):
+    fork = Fork(tmp_path_factory.mktemp("fork"))
+    yield fork
+    fork.close()

@@ -5,7 +5,6 @@ import common
 import numpy as np
 import pytest
 import torch
-from conftest import cli
 from sklearn.linear_model import LinearRegression
 from sklearn.metrics import mutual_info_score
 from torch import distributions as D
@@ -19,9 +18,9 @@ def test_trajectories_have_constant_speed_and_turn(s1):
     np.testing.assert_allclose(np.degrees(np.arctan2(steps[:, 1], steps[:, 0])), [30, 40, 50, 60, 70])
 
 
-def test_data_set_from_the_command_line_follows_table_1(tmp_path):
+def test_data_set_from_the_command_line_follows_table_1(fork, tmp_path):
     for out, seed in (("a", 0), ("b", 0), ("c", 1)):
-        done = cli("01_make_dataset", "--out", tmp_path / out, "--trajectories", 20_000, "--seed", seed)
+        done = fork("01_make_dataset", "--out", tmp_path / out, "--trajectories", 20_000, "--seed", seed)
         assert done.returncode == 0 and "Table 1" in done.stdout, done.stderr
     a, b, c = (np.load(tmp_path / f"{out}/runs/dataset_main_seed{seed}.npz") for out, seed in (("a", 0), ("b", 0), ("c", 1)))
     assert np.array_equal(a["factors"], b["factors"]) and not np.array_equal(a["factors"], c["factors"])
@@ -34,10 +33,10 @@ def test_data_set_from_the_command_line_follows_table_1(tmp_path):
     assert (tmp_path / "a/figures/fig09_dataset.png").stat().st_size > 10_000
 
 
-def test_the_other_data_sets_from_the_command_line(tmp_path):
+def test_the_other_data_sets_from_the_command_line(fork, tmp_path):
     """Table 1's full circle and accelerations, read back from the trajectories by differences."""
     for experiment, columns in (("full", 2), ("polar", 2), ("speed_acc", 1), ("four_factors", 2)):
-        assert cli("01_make_dataset", "--out", tmp_path, "--experiment", experiment, "--trajectories", 4000).returncode == 0
+        assert fork("01_make_dataset", "--out", tmp_path, "--experiment", experiment, "--trajectories", 4000).returncode == 0
         data = np.load(tmp_path / f"runs/dataset_{experiment}_seed0.npz")
         steps, f = np.diff(data["trajectories"].astype(float), axis=1), dict(zip(data["names"], data["factors"].T.astype(float)))
         assert steps.shape == (4000, 5, columns) and f["speed"].min() < (0.01 if columns == 2 else -0.99) and f["speed"].max() > 0.99

@@ -201,9 +201,9 @@ def test_claims_are_judged_by_the_interval_of_the_difference(s4):
 
 # ---------------------------------------------------------------- command line
 
-def test_command_line_prints_the_table_and_writes_everything(tmp_path):
+def test_command_line_prints_the_table_and_writes_everything(fork, tmp_path):
     flags = ["--out", tmp_path, "--trials", 2, "--samples", 50]
-    done = cli("04_mpc_maze", *flags, "--episode", 200)
+    done = fork("04_mpc_maze", *flags, "--episode", 200)
     assert done.returncode == 0, done.stderr
     rows = common.read_csv(tmp_path / "results/mazes.csv")
     assert len(rows) == 2 * 2 * 2 * 2 and {row["maze"] for row in rows} == {"maze1", "maze2"}
@@ -212,16 +212,16 @@ def test_command_line_prints_the_table_and_writes_everything(tmp_path):
                for p in ("relation", "decoder"))
     for name in ("fig03_trajectory_scaling.png", "fig06_mazes.png", "fig08_mpc_examples.png", "fig17_more_examples.png", "maze1.gif", "maze2.gif"):
         assert (tmp_path / "figures" / name).stat().st_size > 10_000
-    again = cli("04_mpc_maze", *flags, "--episode", 200, "--animate", "false")  # same seed, same numbers
+    again = fork("04_mpc_maze", *flags, "--episode", 200, "--animate", "false")  # same seed, same numbers
     assert again.returncode == 0
     strip = lambda rs: [{k: v for k, v in r.items() if k != "planning_ms"} for r in rs]  # noqa: E731
     assert strip(common.read_csv(tmp_path / "results/mazes.csv")) == strip(rows)
 
 
-def test_figure_7_goes_on_where_it_stopped(tmp_path):
+def test_figure_7_goes_on_where_it_stopped(fork, tmp_path):
     flags = ["--experiment", "figure7", "--out", tmp_path, "--trials", 2, "--sample_sizes", "3 10", "--mazes", "maze1", "--episode", 200,
              "--rewards", "dense"]
-    done = cli("04_mpc_maze", *flags, "--method", "wedis dads")
+    done = fork("04_mpc_maze", *flags, "--method", "wedis dads")
     assert done.returncode == 0, done.stderr
     assert "dads is left out: no policy_ant_dads_seed0.pt; make it with: python 03_train_policy.py --experiment ant_dads --seed 0" in done.stdout \
         or (common.HERE / "pretrained/policy_ant_dads_seed0.pt").exists()
@@ -230,16 +230,16 @@ def test_figure_7_goes_on_where_it_stopped(tmp_path):
     assert len(first) == 2 * 2 * 2 and {row["look_ahead"] for row in first} == {"200"}  # no plan looks beyond the episode's end
     assert (tmp_path / "figures/fig07_planning.png").stat().st_size > 10_000
     assert len(common.read_csv(tmp_path / "results/claims.csv")) == 2 * 15 and len(common.read_csv(tmp_path / "results/table2.csv")) == 5
-    again = cli("04_mpc_maze", *flags, "--method", "wedis wedis_s")
+    again = fork("04_mpc_maze", *flags, "--method", "wedis wedis_s")
     assert again.returncode == 0 and "wedis in maze1 is in figure7.csv already" in again.stdout, again.stderr
     rows = common.read_csv(tmp_path / "results/figure7.csv")
     assert [row for row in rows if row["method"] == "wedis"] == first and {row["method"] for row in rows} >= {"wedis", "wedis_s"}
 
 
-def test_stopping_at_the_goal_ends_a_trial_where_it_was_nearest(tmp_path):
+def test_stopping_at_the_goal_ends_a_trial_where_it_was_nearest(fork, tmp_path):
     flags = ["--experiment", "best", "--out", tmp_path, "--trials", 2, "--mazes", "maze1", "--rewards", "dense", "--sample_sizes", 100,
              "--stop_at_goal", 40]  # everywhere is near: it stops as soon as it walks away
-    done = cli("04_mpc_maze", *flags)
+    done = fork("04_mpc_maze", *flags)
     assert done.returncode == 0, done.stderr
     rows = common.read_csv(tmp_path / "results/best.csv")
     assert len(rows) == 2 and all("planner=cem" in row["options"] and "stop_at_goal=40.0" in row["options"] for row in rows)

@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from conftest import cli
 from torch import distributions as D
 from torch import nn
 
@@ -215,15 +214,15 @@ def test_relation_of_the_half_cheetah_is_recovered_likewise(s3, monkeypatch):
 
 # ---------------------------------------------------------------- the command line
 
-def test_three_stages_from_the_command_line(tmp_path):
+def test_three_stages_from_the_command_line(fork, tmp_path):
     """01 -> 02 -> 03 in a new folder; 03 prints and writes what the README says it does."""
-    assert cli("01_make_dataset", "--out", tmp_path, "--trajectories", 3000).returncode == 0
-    done = cli("02_train_wetvae", "--out", tmp_path, "--batch", 500, "--held_out", 500, "--epochs", 2)
+    assert fork("01_make_dataset", "--out", tmp_path, "--trajectories", 3000).returncode == 0
+    done = fork("02_train_wetvae", "--out", tmp_path, "--batch", 500, "--held_out", 500, "--epochs", 2)
     assert done.returncode == 0 and done.stdout.count("purity") == 2 * 4, done.stdout + done.stderr  # two headings, two times three axes
     assert len(common.read_csv(tmp_path / "results/wetvae.csv")) == 6 and len(common.read_csv(tmp_path / "results/crosstalk.csv")) == 18
-    done = cli("03_train_policy", "--out", tmp_path, "--updates", 80, "--reports", 2, "--warm_up", 1000, "--replay", 5000,
-               "--hidden", 32, "--coverage", 5)
-    assert done.returncode == 0 and "calibrated: z_direction +" in done.stdout and f"using {tmp_path}" in done.stdout, done.stderr
+    done = fork("03_train_policy", "--out", tmp_path, "--updates", 80, "--reports", 2, "--warm_up", 1000, "--replay", 5000,
+               "--hidden", 32, "--coverage", 5, "--traversal", 3)
+    assert done.returncode == 0 and "calibrated: z_direction " in done.stdout and f"using {tmp_path}" in done.stdout, done.stderr
     row, = common.read_csv(tmp_path / "results/policies.csv")
     assert row["experiment"] == "ant_semi" and int(row["updates"]) == 80 and float(row["tracking_error"]) > 0
     curve = common.read_csv(tmp_path / "results/learning_curve_ant_semi_seed0.csv")
@@ -232,13 +231,13 @@ def test_three_stages_from_the_command_line(tmp_path):
         assert (tmp_path / f"figures/{name}.png").stat().st_size > 10_000
 
 
-def test_half_cheetah_and_full_circle_from_the_command_line(tmp_path):
+def test_half_cheetah_and_full_circle_from_the_command_line(fork, tmp_path):
     for experiment, data, decoder in (("half_cheetah", "speed_acc", "speed_acc"), ("ant_full", "full", "full")):
-        assert cli("01_make_dataset", "--out", tmp_path, "--experiment", data, "--trajectories", 2000).returncode == 0
-        done = cli("02_train_wetvae", "--out", tmp_path, "--experiment", decoder, "--batch", 500, "--held_out", 500, "--epochs", 1)
+        assert fork("01_make_dataset", "--out", tmp_path, "--experiment", data, "--trajectories", 2000).returncode == 0
+        done = fork("02_train_wetvae", "--out", tmp_path, "--experiment", decoder, "--batch", 500, "--held_out", 500, "--epochs", 1)
         assert done.returncode == 0, done.stderr
-        done = cli("03_train_policy", "--out", tmp_path, "--experiment", experiment, "--updates", 8, "--reports", 1, "--warm_up", 640,
-                   "--replay", 2000, "--hidden", 32, "--coverage", 5)
+        done = fork("03_train_policy", "--out", tmp_path, "--experiment", experiment, "--updates", 8, "--reports", 1, "--warm_up", 640,
+                   "--replay", 2000, "--hidden", 32, "--coverage", 5, "--traversal", 3)
         assert done.returncode == 0 and "tracking error" in done.stdout, done.stderr
     rows = common.read_csv(tmp_path / "results/policies.csv")
     assert {r["experiment"]: r["robot"] for r in rows} == dict(half_cheetah="half_cheetah", ant_full="ant")
