@@ -56,7 +56,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
     "main": dict(MODELS={"": {}, "none": NONE}, FIGURE="fig04_latent_traversals", COLUMNS=[
         ("(a) WET-VAE, T = 1", "main", 1), ("(b) WET-VAE, T = 5", "main", 5), ("(c) WET-VAE, T = 10", "main", 10),
         ("(d) trajectory VAE, T = 5", "main_none", 5)]),
-    "seeds": dict(MODELS={"": {}, "none": NONE}, FIGURE="seeds_wetvae"),  # each --seed adds rows to results/ and points to the figure
+    "seeds": dict(MODELS={"": {}, "own": MENDED, "none": NONE}, FIGURE="seeds_wetvae"),  # each --seed adds rows to results/ and points to the figure
     "beta_gamma": dict(EPOCHS=12, FIGURE="fig10_beta_gamma", MODELS={f"b{b}_g{g}": dict(BETA=float(b), GAMMA=float(g)) for b, g in BETA_GAMMA},
                        COLUMNS=[(f"({c}) β = {b}, γ = {g}", f"beta_gamma_b{b}_g{g}", 5) for c, (b, g) in zip("abcde", BETA_GAMMA)]),
     "polar": MENDED | dict(DATA="polar", LABELS="speed angle", MODELS={"": {}, "none": NONE | dict(FACTORS="speed direction, x y")}),
@@ -122,12 +122,12 @@ class Ordered(nn.Module):
         return self.scale * z @ self.order + self.bias
 
 
-def label_decoders(labels, z_dim, circle):
-    """p(y^m | .) of each label and the part of z it reads: all of it, or with OWN_AXIS its own latent (an angle's circle: the first two)."""
+def label_decoders(labels, z_dim, circle, own_axis):
+    """p(y^m | .) of each label and the part of z it reads: all of it, or with own_axis its own latent (an angle's circle: the first two)."""
     heads, parts, rest = [], [], iter(range(2 * circle, z_dim))
     for name in labels:
         classes, closed = LABEL_RULES[name][0], circle and name == "angle"
-        if OWN_AXIS:
+        if own_axis:
             parts.append(slice(0, 2) if closed else slice(m := next(rest), m + 1))
             heads.append(Ordered(classes, closed))
         else:
@@ -150,8 +150,9 @@ def train(encoder, decoder, x, y, sizes, variant, config):
     """Maximise Eq. 4. x (N, T, x_dim) displacements, y (N, M) classes, sizes: number of classes of each label (none: []).
     Trains encoder and decoder in place and returns the seconds it took."""
     z_dim = encoder.head[2].out_features // 2
-    classifiers, parts = label_decoders(config["LABELS"].split(), z_dim, len(decoder.circle) > 0)
+    classifiers, parts = label_decoders(config["LABELS"].split(), z_dim, len(decoder.circle) > 0, config["OWN_AXIS"])
     model = nn.ModuleList([encoder, decoder, classifiers])
+    epochs = config["EPOCHS"]
     optimizer = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE, fused=True)
     epoch, seconds, last_save, per_epoch = 0, 0.0, time.time(), len(x) // BATCH
     if resumable(OUT, "wetvae-checkpoint", variant, SEED, RESUME):
@@ -161,10 +162,10 @@ def train(encoder, decoder, x, y, sizes, variant, config):
         optimizer.load_state_dict(state["optimizer"])
         epoch, seconds = state["epoch"], state["seconds"]
         torch.set_rng_state(state["rng"])
-    while epoch < EPOCHS:
+    while epoch < epochs:
         clock = time.time()
         for i, rows in enumerate(torch.randperm(len(x))[:per_epoch * BATCH].view(per_epoch, BATCH)):
-            progress = (epoch + i / per_epoch) / EPOCHS
+            progress = (epoch + i / per_epoch) / epochs
             for group in optimizer.param_groups:
                 group["lr"] = LEARNING_RATE * (1 - progress)
             states, labels, kl = objective(encoder, decoder, classifiers, parts, x[rows], y[rows], sizes)
@@ -178,11 +179,11 @@ def train(encoder, decoder, x, y, sizes, variant, config):
         if not math.isfinite(loss.item()):
             stop(f"the loss is {loss.item()} in epoch {epoch}; nothing was overwritten: go on from the last good "
                  f"{artifact_name('wetvae-checkpoint', variant, SEED)} with --resume true, or lower --learning_rate", code=1)
-        if epoch % 4 == 0 or epoch == EPOCHS:
-            print(f"epoch {epoch:3d}/{EPOCHS}  objective {-loss.item():8.3f}  log p(tau|z) {states.item():7.3f}  log p(y|z) "
+        if epoch % 4 == 0 or epoch == epochs:
+            print(f"epoch {epoch:3d}/{epochs}  objective {-loss.item():8.3f}  log p(tau|z) {states.item():7.3f}  log p(y|z) "
                   f"{labels.item():7.3f}  KL {kl.item():6.3f}  {epoch * per_epoch / seconds:4.0f} updates/s  "
-                  f"{seconds * (EPOCHS / epoch - 1):4.0f} s left", flush=True)
-        if time.time() - last_save >= 60 * CHECKPOINT or epoch == EPOCHS:
+                  f"{seconds * (epochs / epoch - 1):4.0f} s left", flush=True)
+        if time.time() - last_save >= 60 * CHECKPOINT or epoch == epochs:
             save(OUT, "wetvae-checkpoint", variant, SEED, config, model=model.state_dict(), optimizer=optimizer.state_dict(),
                  epoch=epoch, seconds=seconds, rng=torch.get_rng_state())
             last_save = time.time()
@@ -338,12 +339,13 @@ def draw_seeds(name):
     figure, axes = plt.subplots(1, len(columns), figsize=(4.2 * len(columns), 3.2))
     for ax, (column, text) in zip(axes, columns.items()):
         shown = [f for f in factors if any(row[column] for row in rows if row["factor"] == f)]
-        for k, (labels, colour) in enumerate(zip(models, (common.BLUE, common.RED))):
+        for k, (labels, colour) in enumerate(zip(models, (common.BLUE, common.RED, common.GREY))):
             for i, factor in enumerate(shown):
                 v = np.array([float(row[column]) for row in rows if (row["labels"], row["factor"]) == (labels, factor) and row[column]])
                 low, high = bootstrap_interval(v)
-                at = i + 0.3 * k - 0.15
-                title = {"none": "trajectory VAE", "circle": "circle"}.get(labels, "Gaussian axis" if "circle" in models else "WET-VAE")
+                at = i + 0.25 * (k - (len(models) - 1) / 2)
+                title = "Gaussian axis" if "circle" in models else "WET-VAE"
+                title = {"none": "trajectory VAE", "circle": "circle", "own": "own axes"}.get(labels, title)
                 ax.plot(at + np.linspace(-0.08, 0.08, len(v)), v, ".", color=colour, alpha=0.6, label=f"{title}, {len(v)} seeds" if i == 0 else None)
                 ax.errorbar(at, v.mean(), [[v.mean() - low], [high - v.mean()]], color="black", fmt="_", ms=14, capsize=3)
                 worst = v.max() if column == "largest_gap_deg" else v.min()

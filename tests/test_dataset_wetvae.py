@@ -93,7 +93,7 @@ def test_direction_on_a_circle(s2):
     assert angles.mean().item() == pytest.approx(math.pi / 2, abs=0.01) and angles.std().item() == pytest.approx(0.3, abs=0.01)
 
 
-def test_ordered_labels_lie_on_their_axis_in_order(s2, monkeypatch):
+def test_ordered_labels_lie_on_their_axis_in_order(s2):
     """Along the axis the likeliest class goes up by neighbours only: right, straight, left; round the circle 0, 1, 2, 3 and back to 0."""
     z = torch.linspace(-4, 4, 401)[:, None]
     assert list(dict.fromkeys(s2.Ordered(3, False)(z).softmax(1).add(torch.tensor([1e-3, 0, 0])).argmax(1).tolist())) == [2, 0, 1]
@@ -102,12 +102,10 @@ def test_ordered_labels_lie_on_their_axis_in_order(s2, monkeypatch):
     assert list(dict.fromkeys(four(z).argmax(1).tolist())) == [0, 1, 2, 3]
     turn = torch.linspace(-0.1, 6.1, 401)
     assert list(dict.fromkeys(s2.Ordered(4, True)(torch.stack([turn.cos(), turn.sin()], 1)).argmax(1).tolist())) == [0, 1, 2, 3]
-    monkeypatch.setattr(s2, "OWN_AXIS", True)
-    heads, parts = s2.label_decoders(["speed", "angle", "curvature"], 4, True)
+    heads, parts = s2.label_decoders(["speed", "angle", "curvature"], 4, True, True)
     assert parts == [slice(2, 3), slice(0, 2), slice(3, 4)]
     assert [head(torch.zeros(5, 4)[:, part]).shape for head, part in zip(heads, parts)] == [(5, 4), (5, 4), (5, 3)]
-    monkeypatch.setattr(s2, "OWN_AXIS", False)  # Eq. 4: every label from all of z
-    assert s2.label_decoders(["speed", "curvature"], 3, False)[1] == [slice(None)] * 2
+    assert s2.label_decoders(["speed", "curvature"], 3, False, False)[1] == [slice(None)] * 2  # Eq. 4: every label from all of z
 
 
 def test_matching_allows_a_direction_to_be_cut_open_anywhere(s2):

@@ -39,10 +39,16 @@ def tables():
     for (experiment, labels, factor), rows in groups.items():
         purity, corr, gaps = (np.array([float(r[k]) for r in rows if r[k]]) for k in ("purity", "abs_corr", "largest_gap_deg"))
         low, high = common.bootstrap_interval(purity)
-        name = {"none": "trajectory VAE", "circle": "circle"}.get(labels, "Gaussian axis" if experiment == "full" else "WET-VAE")
+        name = {"none": "trajectory VAE", "circle": "circle", "own": "own axes"}.get(labels, "Gaussian axis" if experiment == "full" else "WET-VAE")
         empty = f"{gaps.mean():.1f}°, {gaps.max():.1f}°" if len(gaps) else "–"
         seeds.append(f"| {experiment}, {name} | {factor} | {purity.mean():.3f} | {low:.3f} .. {high:.3f} | {purity.min():.3f} "
                      f"({rows[purity.argmin()]['seed']}) | {corr.mean():.2f} | {empty} | {len(rows)} |")
+    for factor in dict.fromkeys(factor for experiment, _, factor in groups if experiment == "seeds"):
+        ours, plain = ({r["seed"]: float(r["purity"]) for r in groups.get(("seeds", labels, factor), [])} for labels in ("seeds", "none"))
+        gap = np.array([ours[seed] - plain[seed] for seed in ours if seed in plain])
+        low, high = common.bootstrap_interval(gap)
+        seeds.append(f"| seeds, WET-VAE − trajectory VAE | {factor} | {gap.mean():.3f} | {low:.3f} .. {high:.3f} | {gap.min():.3f} | – | – | "
+                     f"{len(gap)} |")
     policies = ["| policy | seed | updates | minutes | tracking error, mean actions | sampled | direction error | speed ratio slow / middle / fast "
                 "| flips | executed purity speed / direction / curvature / acceleration |", "|---|---|---|---|---|---|---|---|---|---|"]
     for r in results["policies"]:
