@@ -2,8 +2,8 @@
 
 Reads runs/dataset_*.npz. Trains the WET-VAE (Eq. 4) and, for comparison, the same model without labels (the trajectory
 VAE), finds which latent is which factor, and writes runs/wetvae_<experiment>_seed<seed>.pt (and <experiment>_none),
-Fig 4, results/wetvae.csv and results/crosstalk.csv. Takes 4.3 minutes on two cores (AMD EPYC 7003, no AVX-512).
-Expect: |corr| 0.98, 0.98, 0.91; purity 0.95, 0.93, 0.86; without labels the axes are entangled (seed 0).
+its figure, results/wetvae.csv and results/crosstalk.csv. Takes 4.9 minutes on one core (AMD EPYC 7003, no AVX-512).
+Expect: |corr| 0.98, 0.98, 0.91; purity 0.93, 0.93, 0.88; without labels the axes are entangled (seed 0).
 """
 import itertools
 import math
