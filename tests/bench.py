@@ -6,12 +6,12 @@ update reaches. Every figure is the median of five rounds, taken in turns so tha
 import time
 import warnings
 
+from conftest import ROOT, script  # first: it makes common known
 import common
 import gymnasium
 import mujoco
 import numpy as np
 import torch
-from conftest import ROOT, script
 from torch import nn
 
 S, Z, A, BATCH, ROUNDS = 26, 2, 8, 256, 5

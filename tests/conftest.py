@@ -1,9 +1,12 @@
 """Loads the numbered scripts as modules (their names are no identifiers) and runs them as a user would."""
 import importlib.util
+import itertools
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -35,21 +38,22 @@ SERVER = """
 import json, os, runpy, signal, sys
 import common, torch._dynamo  # all that a script imports, and what its first optimizer imports
 for line in sys.stdin:
-    if not line.strip():  # wait for the last child
-        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
-        continue
     argv, *streams = json.loads(line)
-    child = os.fork()
-    if not child:
-        signal.alarm(3600)  # nothing may hang, however busy the machine
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores Ctrl-C
-        for number, path in enumerate(streams, 1):
-            os.dup2(os.open(path, os.O_WRONLY), number)
-        sys.stdout.reconfigure(line_buffering=True)
-        sys.argv = argv
-        runpy.run_path(argv[0], run_name="__main__")
-        sys.exit()
-    print(child, flush=True)
+    if argv:
+        child, code = os.fork(), None
+        if not child:
+            signal.alarm(600)  # nothing may hang
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores Ctrl-C
+            for number, path in enumerate(streams, 1):
+                os.dup2(os.open(path, os.O_WRONLY), number)
+            sys.stdout.reconfigure(line_buffering=True)
+            sys.argv = argv
+            runpy.run_path(argv[0], run_name="__main__")
+            sys.exit()
+    elif code is None:
+        done, status = os.waitpid(child, *streams)
+        code = os.waitstatus_to_exitcode(status) if done else None
+    print(json.dumps([child, code]), flush=True)
 """
 
 
@@ -58,22 +62,37 @@ class Fork:
     process of its own, to be interrupted and killed, without the seconds that the imports take. One at a time."""
 
     def __init__(self, folder):
-        self.streams = [folder / "stdout", folder / "stderr"]
+        self.streams, self.code = [folder / "stdout", folder / "stderr"], 0
         self.server = subprocess.Popen([sys.executable, "-c", SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
                                        env=os.environ | dict(PYTHONPATH=str(ROOT)))
 
+    def ask(self, *request):
+        print(json.dumps(request), file=self.server.stdin, flush=True)
+        return json.loads(self.server.stdout.readline())
+
     def start(self, name, *flags):
+        if self.code is None:  # a test failed and left it running
+            self.end(signal.SIGKILL)
         for path in self.streams:
             path.write_text("")
-        argv = [str(ROOT / f"{name}.py"), *map(str, flags)]
-        print(json.dumps([argv, *map(str, self.streams)]), file=self.server.stdin, flush=True)
-        self.pid = int(self.server.stdout.readline())
+        self.pid, self.code = self.ask([str(ROOT / f"{name}.py"), *map(str, flags)], *map(str, self.streams))
+
+    def wait_for(self, condition):
+        """Until something is so that the running script does; fails if it ends without."""
+        for poll in itertools.count():
+            if condition():
+                return
+            if poll % 100 == 99:
+                _, self.code = self.ask(None, os.WNOHANG)
+                assert self.code is None, self.end()
+            time.sleep(0.001)
 
     def end(self, number=0):
         """Send a signal, or none, and wait for the end; returns what cli returns."""
-        os.kill(self.pid, number)
-        print(file=self.server.stdin, flush=True)
-        return subprocess.CompletedProcess((), int(self.server.stdout.readline()), *(path.read_text() for path in self.streams))
+        if self.code is None:
+            os.kill(self.pid, number)
+        _, self.code = self.ask(None, 0)
+        return subprocess.CompletedProcess((), self.code, *(path.read_text() for path in self.streams))
 
     def __call__(self, name, *flags):
         self.start(name, *flags)

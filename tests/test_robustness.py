@@ -16,21 +16,14 @@ from conftest import ROOT, Fork, cli
 S1, S2, S3, S4 = "01_make_dataset", "02_train_wetvae", "03_train_policy", "04_mpc_maze"
 TINY_DATA = ["--trajectories", 1500]
 TINY_VAE = ["--batch", 200, "--held_out", 500, "--epochs", 36, "--checkpoint", 0, "--baseline", "false", "--hidden", 32, "--threads", 1]
-TINY_POLICY = ["--updates", 128, "--reports", 8, "--warm_up", 500, "--replay", 1000, "--hidden", 32, "--coverage", 2, "--traversal", 3,
+TINY_POLICY = ["--updates", 128, "--reports", 8, "--warm_up", 500, "--replay", 1000, "--hidden", 32, "--coverage", 2,
                "--checkpoint", 0, "--threads", 1]
 
 
-def wait_for(condition):
-    end = time.monotonic() + 3600
-    while not condition():
-        assert time.monotonic() < end, "what is waited for never came"
-        time.sleep(0.001)
-
-
-def wait_for_versions(file, number):
-    """Until the file was written anew so many times."""
+def versions(fork, file, number):
+    """Wait until the running script has written the file anew so many times."""
     seen = set()
-    wait_for(lambda: seen.add(os.path.exists(file) and os.stat(file).st_mtime_ns) or len(seen) > number)
+    fork.wait_for(lambda: seen.add(os.path.exists(file) and os.stat(file).st_mtime_ns) or len(seen) > number)
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +35,8 @@ def made(tmp_path_factory):
         done = fork(name, "--out", out, *flags)
         assert done.returncode == 0, done.stderr
     fork.start(S3, "--out", out, *TINY_POLICY)
-    wait_for((out / "runs/policy_ant_semi_seed0.pt").exists)
-    fork.end(signal.SIGKILL)  # what it measures takes as long as this training
+    fork.wait_for((out / "runs/policy_ant_semi_seed0.pt").exists)
+    fork.end(signal.SIGKILL)  # to measure would take longer than this training
     fork.close()
     return out
 
@@ -66,18 +59,20 @@ def test_training_killed_five_times_ends_with_the_same_bits(name, kind, experime
     partial, rng, reached = f"{file}.partial", np.random.default_rng(1), [0]
     for kill, moment in enumerate(sorted(rng.integers(last // every - 2, size=5))):
         fork.start(name, "--out", copy, "--resume", "true", *flags)
-        wait_for(lambda: file.name in fork.streams[0].read_text())  # it says what it goes on from: now it trains
-        wait_for_versions(file, moment - reached[-1] // every)
+        fork.wait_for(lambda: file.name in fork.streams[0].read_text())  # it says what it goes on from: now it trains
+        versions(fork, file, moment - reached[-1] // every)
         time.sleep(rng.uniform(0, pause))
         if kill % 2:
-            wait_for_versions(partial, 1)
+            versions(fork, partial, 1)
         done = fork.end(signal.SIGKILL)
         assert done.returncode == -signal.SIGKILL, f"finished before kill {kill + 1}: make the training longer; {done.stderr}"
         if file.exists():
             reached.append(common.load(copy, f"{kind}-checkpoint", experiment, 0)[progress])  # whole, whatever the moment
     assert reached == sorted(reached) and len(set(reached)) > 3
-    done = fork(name, "--out", copy, "--resume", "true", *flags)
-    assert done.returncode == 0 and not os.path.exists(partial), done.stderr
+    fork.start(name, "--out", copy, "--resume", "true", *flags)
+    fork.wait_for((copy / "runs" / common.artifact_name(kind, experiment, 0)).exists)
+    done = fork.end(number := 0 if kind == "wetvae" else signal.SIGKILL)
+    assert done.returncode == -number and not os.path.exists(partial), done.stderr
     for part in (kind, f"{kind}-checkpoint"):
         whole, cut = (common.load(out, part, experiment, 0) for out in (made, copy))
         for content in (whole, cut):  # compare all but the clock, and the flags --out and --resume
@@ -228,7 +223,7 @@ def test_an_artifact_made_with_other_flags_or_of_another_kind_is_refused(name, f
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_and_sigterm_end_with_one_line(number, fork, copy):
     fork.start(S2, "--out", copy, *TINY_VAE, "--epochs", 2000)
-    wait_for(lambda: "\nepoch" in fork.streams[0].read_text())
+    fork.wait_for(lambda: "\nepoch" in fork.streams[0].read_text())
     done = fork.end(number)
     assert done.returncode != 0 and "stopped by hand" in done.stderr and "--resume true" in done.stderr, done.stderr
     assert done.stderr.strip().count("\n") == 0
