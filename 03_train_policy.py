@@ -57,6 +57,7 @@ VARIANCE_SCALE = 0.05    # decoder variance -> square metres, App. A.1.3: 1/20
 FLOOR_START = 0.04       # metres, least standard deviation of the reward: a sharp one makes standing still a trap
 FLOOR_END = 0.01         # shrinks to this between 0.15 and 0.6 of the updates: teaches the slow skills
 
+CALIBRATED = 8           # starts at each of 33 speeds from which told speeds are calibrated; 0: not (the paper)
 TRAVERSAL = 25           # skills on each axis at which executed purity and the relation function are measured
 COVERAGE = 200           # random skills whose visited cells of 1 m are counted at the end
 
@@ -240,6 +241,31 @@ def calibrate_relation(decoder, steps=5):
     return round((low + high) / 2, 4), miss
 
 
+def to_tell(asked, achieved, z):
+    """For each speed asked (K,) the z_speed to tell: where the achieved speed (K,) at z (K,) is the one asked. Noise can make achieved
+    speeds fall with z: the mean of the nearest rising curves above and below is inverted. (K,)."""
+    rising = (np.maximum.accumulate(achieved) + np.minimum.accumulate(achieved[::-1])[::-1]) / 2
+    return np.interp(asked, rising + 1e-9 * np.arange(len(z)), z)
+
+
+def calibrate_speeds(actor, decoder):
+    """Beyond the paper: the policy's achieved speeds, over an episode from noisy starts and in all directions, inverted. (2, 33) for actor.told:
+    every skill is then told a little faster than it is asked, by as much as the policy lags."""
+    z = torch.linspace(-2, 2, 33)
+    skills = nn.functional.pad(torch.cartesian_prod(z, 3 * torch.rand(CALIBRATED) - 1.5), (0, 1)) if ROBOT == "ant" else (
+        nn.functional.pad(z.repeat_interleave(CALIBRATED)[:, None], (0, 1)))
+    robots = make_robots(len(skills))
+    robots.reset(np.arange(len(skills)), np.random.default_rng(SEED + 1))  # not the starts of the tracking grid
+    start, step = robots.qpos[:, :robots.place].copy(), predict(decoder, skills, 1)[:, 0].double().numpy()
+    for _ in execute(actor, robots, skills, 1, EPISODE, 0.0, deterministic=True):
+        pass
+    walked = (robots.qpos[:, :robots.place] - start) / (EPISODE * STEP_SCALE)
+    if ROBOT == "ant":  # along the step; on a rail the sign counts
+        walked, step = (walked * step).sum(1, keepdims=True) / np.linalg.norm(step, axis=1, keepdims=True), np.linalg.norm(step, axis=1)
+    asked, achieved = (v.reshape(33, CALIBRATED).mean(1) for v in (step, walked))
+    return torch.stack([z, torch.from_numpy(to_tell(asked, achieved, z.numpy())).float()])
+
+
 def draw_skills(actor, decoder, weight, name, columns):
     """Fig 5 (WEDIS), 15, 16: predicted (top) and executed (bottom) skills; a column per (axis, values, T, H_z). In one dimension the
     latent is on the y axis and time steps have colours."""
@@ -279,13 +305,34 @@ def draw_learning_curve(curve):
     figure, (error, returns) = plt.subplots(1, 2, figsize=(8, 3))
     minutes = [row["minutes"] for row in curve]
     error.plot(minutes, [row["tracking_error"] for row in curve], ".-", color=common.BLUE)
-    error.set(xlabel="minutes on two cores", ylabel="tracking error (25 skills)", ylim=(0, 1.1))
+    error.set(xlabel=f"minutes of training ({THREADS} thread{'s' * (THREADS > 1)})", ylabel=f"tracking error ({len(grid())} skills)", ylim=(0, 1.1))
     for name, colour in (("slow", common.GREY), ("mid", common.RED), ("fast", common.BLUE)):
         returns.plot(minutes, [row["speed_" + name] for row in curve], ".-", color=colour, label=name)
     returns.axhline(1, color="black", lw=0.8, ls="--")
-    returns.set(xlabel="minutes on two cores", ylabel="achieved / commanded speed", ylim=(-0.1, 1.3))
+    returns.set(xlabel=error.get_xlabel(), ylabel="achieved / commanded speed", ylim=(-0.1, 1.3))
     returns.legend()
     save_figure(figure, OUT, f"learning_curve_{EXPERIMENT}")
+
+
+def draw_robots():
+    """Fig 14: both robots, rendered by MuJoCo off-screen."""
+    figure, axes = plt.subplots(1, 2, figsize=(8, 3.2))
+    for ax, title, spec in zip(axes, ("Ant", "Half-Cheetah"), (ant_spec(), half_cheetah_spec())):
+        model = spec.compile()
+        data, camera = mujoco.MjData(model), mujoco.MjvCamera()
+        data.qpos[:] = model.key_qpos[0] if model.nkey else model.qpos0
+        mujoco.mj_forward(model, data)
+        camera.lookat, camera.distance, camera.azimuth, camera.elevation = data.qpos[:3] if model.nkey else (0, 0, 0.5), 3, 120, -20
+        try:
+            renderer = mujoco.Renderer(model, 400, 500)
+        except Exception:  # no GL library, no device: the kinds differ by platform
+            print("no Fig 14: MuJoCo's renderer needs a GL library; install libegl1 (Debian, Ubuntu) or OSMesa with MUJOCO_GL=osmesa")
+            return plt.close(figure)
+        renderer.update_scene(data, camera)
+        ax.imshow(renderer.render())
+        ax.set(title=title, xticks=[], yticks=[])
+        ax.grid(False)
+    save_figure(figure, OUT, "fig14_robots")
 
 
 # ---------------------------------------------------------------- training
@@ -425,6 +472,8 @@ if __name__ == "__main__":
         if not BATCH <= WARM_UP <= REPLAY or not UPDATES:
             stop(f"--updates must be at least 1 and --warm_up {WARM_UP} must lie between --batch {BATCH} and --replay {REPLAY}")
         trained = train(decoder, config)
+        if CALIBRATED:
+            trained["actor"]["told"] = calibrate_speeds(load_actor(trained | dict(decoder=decoder_content["decoder"])), decoder)
         save(OUT, "policy", EXPERIMENT, SEED, config, decoder=decoder_content["decoder"], relation_weight=weight, **trained)
     policy = load(OUT, "policy", EXPERIMENT, SEED)
     actor = load_actor(policy)
@@ -441,6 +490,10 @@ if __name__ == "__main__":
         away, size = (np.linalg.norm(v, axis=1).mean() for v in (paths(actor, z, 5, 40, w)[:, -1] - predicted, predicted))
         print(f"  on the robot (T = 5, H_z = 40): weight {w:.3f} ends {away:.2f} m from the decoder's path of {size:.1f} m")
 
+    told, actor.told = actor.told, torch.zeros(2, 0)
+    error_as_trained, *_, ratio = tracking(*grid_run(actor, decoder)[:2])
+    actor.told = told
+    print(f"\nas trained: tracking error {error_as_trained:.3f}, achieved/commanded {' '.join(f'{v:.2f}' for v in ratio)}; with speeds calibrated:")
     executed, commanded, flipped = grid_run(actor, decoder)
     error, degrees, ratio = tracking(executed, commanded)
     torch.manual_seed(SEED)
@@ -451,7 +504,7 @@ if __name__ == "__main__":
     C, purity = cross_talk([factors_of(profile, accelerating) for profile in profiles], names, decoder_content["ranges"])
     skills = nn.functional.pad(torch.randn(COVERAGE, len(names) - 1), (0, 1))
     coverage = len(np.unique(np.floor(paths(actor, skills, 1, EPISODE, 0.0).reshape(COVERAGE * (EPISODE + 1), -1)), axis=0))
-    print(f"\ntracking error {error:.3f} (mean actions), {error_sampled:.3f} (sampled actions); flips {flipped.sum()} of {len(flipped)}")
+    print(f"tracking error {error:.3f} (mean actions), {error_sampled:.3f} (sampled actions); flips {flipped.sum()} of {len(flipped)}")
     print("from slow to fast")
     print("direction error deg " + " ".join(f"{d:6.1f}" for d in degrees))
     print("achieved/commanded  " + " ".join(f"{v:6.2f}" for v in ratio))
@@ -467,7 +520,7 @@ if __name__ == "__main__":
         train_minutes=policy["seconds"] / 60, tracking_error=error, tracking_error_sampled=error_sampled,
         direction_error_deg=degrees[2:].mean(), speed_ratio_slow=slow, speed_ratio_mid=mid, speed_ratio_fast=fast, flips=int(flipped.sum()),
         **{f"purity_{n}": dict(zip(names, purity)).get(n, "") for n in ("speed", "direction", "curvature", "acceleration")},
-        coverage_cells=coverage)], ("experiment", "method", "seed"))
+        coverage_cells=coverage, tracking_error_as_trained=error_as_trained)], ("experiment", "method", "seed"))
     five, circle = list(common.LATENT_COLOURS), [round(float(v), 3) for v in grid()[:DIRECTIONS, 1]] if ant else []
     draw_skills(actor, decoder, weight, *{
         "ant_semi": ("fig05_skills_wedis", [("$z_{speed}$", 0, five, 1, 100), ("$z_{dir}$", 1, five, 1, 100), ("$z_{cur}$", 2, five, 5, 40)]),
@@ -475,3 +528,4 @@ if __name__ == "__main__":
         "half_cheetah": ("fig16_half_cheetah", [("$z_{speed}$", 0, np.linspace(-1, 1, 9), 6, 20), ("$z_{acc}$", 1, np.linspace(-1, 1, 9), 6, 20)]),
     }[EXPERIMENT])
     draw_learning_curve(policy["curve"])
+    draw_robots()
