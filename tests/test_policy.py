@@ -287,7 +287,8 @@ def test_three_stages_from_the_command_line(fork, tmp_path):
 def test_half_cheetah_and_full_circle_from_the_command_line(fork, tmp_path):
     for experiment, data, decoder in (("half_cheetah", "speed_acc", "speed_acc"), ("ant_full", "full", "full")):
         assert fork("01_make_dataset", "--out", tmp_path, "--experiment", data, "--trajectories", 2000).returncode == 0
-        done = fork("02_train_wetvae", "--out", tmp_path, "--experiment", decoder, "--batch", 500, "--held_out", 500, "--epochs", 1, "--baseline_epochs", 1)
+        done = fork("02_train_wetvae", "--out", tmp_path, "--experiment", decoder, "--batch", 500, "--held_out", 500, "--epochs", 1,
+                    "--baseline_epochs", 1)
         assert done.returncode == 0, done.stderr
         done = fork("03_train_policy", "--out", tmp_path, "--experiment", experiment, "--updates", 8, "--reports", 1, "--warm_up", 640,
                    "--replay", 2000, "--hidden", 32, "--coverage", 5, "--traversal", 3, "--calibrated", 1)
