@@ -592,7 +592,7 @@ def train(method, config):
             group["lr"] = LEARNING_RATE * min(1, max(0, 2 * (1 - progress)))
         s, a, _, displacement, skill = replay[trajectories(MODEL_BATCH, span, env_steps, replay, RECENT)].split(columns, 2)
         model_loss = method.loss(s, a, displacement, skill, actor)
-        share = min(span, UPDATES_PER_STEP)  # steps of a trajectory in the batch, one in each update: decoded and relabelled once
+        share = min(span, 2 * UPDATES_PER_STEP)  # steps of a trajectory in the batch, two in each update: decoded and relabelled once
         rows = trajectories(UPDATES_PER_STEP * BATCH // share, span, env_steps, replay, len(replay))
         t, skill = torch.randint(span, (share, len(rows))), replay[rows[:, 0], -z_dim:]
         fresh = torch.rand(len(skill)) < RELABELLED
