@@ -72,6 +72,7 @@ KL_WEIGHT = 2.0          # SeCTAR
 CLONING = 100.0          # SeCTAR: weight of behaviour cloning
 VAE_SCALE = 0.01         # of SeCTAR's loss beside SAC's; Adam does not notice, but for the actor: cloning against reward
 
+CALIBRATED = 8           # starts at each of 33 speeds from which told speeds are calibrated; 0: not (the paper)
 TRAVERSAL = 25           # skills on each axis at which executed purity and the relation function are measured
 COVERAGE = 200           # random skills whose visited cells of 1 m are counted at the end
 
@@ -402,6 +403,31 @@ def calibrate_relation(decoder, steps=5):
     return round((low + high) / 2, 4), miss
 
 
+def to_tell(asked, achieved, z):
+    """For each speed asked (K,) the z_speed to tell: where the achieved speed (K,) at z (K,) is the one asked. Noise can make achieved
+    speeds fall with z: the mean of the nearest rising curves above and below is inverted. (K,)."""
+    rising = (np.maximum.accumulate(achieved) + np.minimum.accumulate(achieved[::-1])[::-1]) / 2
+    return np.interp(asked, rising + 1e-9 * np.arange(len(z)), z)
+
+
+def calibrate_speeds(actor, decoder):
+    """Beyond the paper: the policy's achieved speeds, over an episode from noisy starts and in all directions, inverted. (2, 33) for actor.told:
+    every skill is then told a little faster than it is asked, by as much as the policy lags."""
+    z = torch.linspace(-2, 2, 33)
+    skills = nn.functional.pad(torch.cartesian_prod(z, 3 * torch.rand(CALIBRATED) - 1.5), (0, 1)) if ROBOT == "ant" else (
+        nn.functional.pad(z.repeat_interleave(CALIBRATED)[:, None], (0, 1)))
+    robots = make_robots(len(skills))
+    robots.reset(np.arange(len(skills)), np.random.default_rng(SEED + 1))  # not the starts of the tracking grid
+    start, step = robots.qpos[:, :robots.place].copy(), predict(decoder, skills, 1)[:, 0].double().numpy()
+    for _ in execute(actor, robots, skills, 1, EPISODE, 0.0, deterministic=True):
+        pass
+    walked = (robots.qpos[:, :robots.place] - start) / (EPISODE * STEP_SCALE)
+    if ROBOT == "ant":  # along the step; on a rail the sign counts
+        walked, step = (walked * step).sum(1, keepdims=True) / np.linalg.norm(step, axis=1, keepdims=True), np.linalg.norm(step, axis=1)
+    asked, achieved = (v.reshape(33, CALIBRATED).mean(1) for v in (step, walked))
+    return torch.stack([z, torch.from_numpy(to_tell(asked, achieved, z.numpy())).float()])
+
+
 def draw_skills(actor, decoder, weight, name, columns):
     """Fig 5, 15, 16: predicted (top) and executed (bottom) skills; a column per (axis, values, T, H_z). In one dimension the
     latent is on the y axis and time steps have colours."""
@@ -441,15 +467,15 @@ def draw_learning_curve(curve):
     figure, (error, returns, *own) = plt.subplots(1, 3 if "metric" in curve[0] else 2, figsize=(12 if "metric" in curve[0] else 8, 3))
     minutes = [row["minutes"] for row in curve]
     error.plot(minutes, [row["tracking_error"] for row in curve], ".-", color=common.BLUE)
-    error.set(xlabel="minutes on two cores", ylabel="tracking error (25 skills)", ylim=(0, 1.1))
+    error.set(xlabel=f"minutes of training ({THREADS} thread{'s' * (THREADS > 1)})", ylabel=f"tracking error ({len(grid())} skills)", ylim=(0, 1.1))
     for name, colour in (("slow", common.GREY), ("mid", common.RED), ("fast", common.BLUE)):
         returns.plot(minutes, [row["speed_" + name] for row in curve], ".-", color=colour, label=name)
     returns.axhline(1, color="black", lw=0.8, ls="--")
-    returns.set(xlabel="minutes on two cores", ylabel="achieved / commanded speed", ylim=(-0.1, 1.3))
+    returns.set(xlabel=error.get_xlabel(), ylabel="achieved / commanded speed", ylim=(-0.1, 1.3))
     returns.legend()
     for ax in own:
         ax.plot(minutes, [row["metric"] for row in curve], ".-", color=common.BLUE)
-        ax.set(xlabel="minutes on two cores", ylabel=f"{METHODS[METHOD].metric}, recent steps")
+        ax.set(xlabel=error.get_xlabel(), ylabel=f"{METHODS[METHOD].metric}, recent steps")
     save_figure(figure, OUT, f"learning_curve_{EXPERIMENT}")
 
 
@@ -488,6 +514,27 @@ def measure_baseline(actor, policy, method, skills):
 def cells(track):
     """How many cells of 1 m the paths (n, K, 2 or 1) in metres visit."""
     return len(np.unique(np.floor(track.reshape(-1, track.shape[2])), axis=0))
+
+
+def draw_robots():
+    """Fig 14: both robots, rendered by MuJoCo off-screen."""
+    figure, axes = plt.subplots(1, 2, figsize=(8, 3.2))
+    for ax, title, spec in zip(axes, ("Ant", "Half-Cheetah"), (ant_spec(), half_cheetah_spec())):
+        model = spec.compile()
+        data, camera = mujoco.MjData(model), mujoco.MjvCamera()
+        data.qpos[:] = model.key_qpos[0] if model.nkey else model.qpos0
+        mujoco.mj_forward(model, data)
+        camera.lookat, camera.distance, camera.azimuth, camera.elevation = data.qpos[:3] if model.nkey else (0, 0, 0.5), 3, 120, -20
+        try:
+            renderer = mujoco.Renderer(model, 400, 500)
+        except Exception:  # no GL library, no device: the kinds differ by platform
+            print("no Fig 14: MuJoCo's renderer needs a GL library; install libegl1 (Debian, Ubuntu) or OSMesa with MUJOCO_GL=osmesa")
+            return plt.close(figure)
+        renderer.update_scene(data, camera)
+        ax.imshow(renderer.render())
+        ax.set(title=title, xticks=[], yticks=[])
+        ax.grid(False)
+    save_figure(figure, OUT, "fig14_robots")
 
 
 # ---------------------------------------------------------------- training
@@ -650,6 +697,8 @@ if __name__ == "__main__":
             stop(f"--updates must be at least 1 and --warm_up {WARM_UP} must lie between --batch {BATCH} and --replay {REPLAY}"
                  + more * (method.span > 1))
         trained = train(method, config)
+        if CALIBRATED and METHOD == "wedis":
+            trained["actor"]["told"] = calibrate_speeds(load_actor(trained), decoder)
         save(OUT, "policy", EXPERIMENT, SEED, config, relation_weight=weight, **trained)
     policy = load(OUT, "policy", EXPERIMENT, SEED)
     check_same(policy, config, ("METHOD",))
@@ -667,6 +716,12 @@ if __name__ == "__main__":
             away, size = (np.linalg.norm(v, axis=1).mean() for v in (paths(actor, z, 5, 40, w)[:, -1] - predicted, predicted))
             print(f"  on the robot (T = 5, H_z = 40): weight {w:.3f} ends {away:.2f} m from the decoder's path of {size:.1f} m")
 
+    told, actor.told = actor.told, torch.zeros(2, 0)
+    error_as_trained, *_, ratio = tracking(*grid_run(actor, decoder)[:2])
+    actor.told = told
+    print()
+    if told.numel():
+        print(f"as trained: tracking error {error_as_trained:.3f}, achieved/commanded {' '.join(f'{v:.2f}' for v in ratio)}; with speeds calibrated:")
     executed, commanded, flipped = grid_run(actor, decoder)
     error, degrees, ratio = tracking(executed, commanded)
     torch.manual_seed(SEED)
@@ -682,7 +737,7 @@ if __name__ == "__main__":
         skills = torch.rand(COVERAGE, AXES) * 2 - 1 if METHOD == "dads" else torch.randn(COVERAGE, AXES)
         purity = {names[f]: p for f, (_, p) in match(C).items()}
     coverage = cells(paths(actor, skills, 1, EPISODE, None if weight is None else 0.0))
-    print(f"\ntracking error {error:.3f} (mean actions), {error_sampled:.3f} (sampled actions); flips {flipped.sum()} of {len(flipped)}")
+    print(f"tracking error {error:.3f} (mean actions), {error_sampled:.3f} (sampled actions); flips {flipped.sum()} of {len(flipped)}")
     print("from slow to fast")
     print("direction error deg " + " ".join(f"{d:6.1f}" for d in degrees))
     print("achieved/commanded  " + " ".join(f"{v:6.2f}" for v in ratio))
@@ -696,14 +751,14 @@ if __name__ == "__main__":
         extra = measure_baseline(actor, policy, method, skills)
         print(f"{method.metric}: " + ", ".join(f"{what} {value:.3f}" for what, value in extra.items()))
         update_csv(Path(OUT) / "results" / "baselines.csv",
-                   [dict(method=EXPERIMENT, seed=SEED, what=what, value=value) for what, value in extra.items()], ("method", "seed", "what"))
+                   [dict(method=EXPERIMENT.removeprefix("ant_"), seed=SEED, what=what, value=value) for what, value in extra.items()], ("method", "seed", "what"))
     slow, mid, fast = by_speed(ratio)
     update_csv(Path(OUT) / "results" / "policies.csv", [dict(
         experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy["updates"], env_steps=policy["env_steps"],
         train_minutes=policy["seconds"] / 60, tracking_error=error, tracking_error_sampled=error_sampled,
         direction_error_deg=degrees[2:].mean(), speed_ratio_slow=slow, speed_ratio_mid=mid, speed_ratio_fast=fast, flips=int(flipped.sum()),
         **{f"purity_{n}": purity.get(n, "") for n in ("speed", "direction", "curvature", "acceleration")},
-        coverage_cells=coverage)], ("experiment", "method", "seed"))
+        coverage_cells=coverage, tracking_error_as_trained=error_as_trained)], ("experiment", "method", "seed"))
     five, circle = list(common.LATENT_COLOURS), [round(float(v), 3) for v in grid()[:DIRECTIONS, 1]] if METHOD == "wedis" and ant else []
     latents = [(f"$z_{i + 1}$", i, five, LENGTH, HOLD) for i in range(AXES)]
     draw_skills(actor, decoder, weight, *{
@@ -714,3 +769,4 @@ if __name__ == "__main__":
         "half_cheetah": ("fig16_half_cheetah", [("$z_{speed}$", 0, np.linspace(-1, 1, 9), 6, 20), ("$z_{acc}$", 1, np.linspace(-1, 1, 9), 6, 20)]),
     }[EXPERIMENT])
     draw_learning_curve(policy["curve"])
+    draw_robots()

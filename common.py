@@ -528,6 +528,7 @@ class Actor(nn.Module):
                                  nn.Linear(hidden, 2 * a_dim))
         self.register_buffer("s_mean", torch.zeros(s_dim))
         self.register_buffer("s_std", torch.ones(s_dim))
+        self.register_buffer("told", torch.zeros(2, 0))  # speeds calibrated by 03: z_speed, evenly spaced, and what to say for it
 
     def inputs(self, s, z, step=None):
         """s (B, n), z (B, m), step: the decoder's mean for z if it is known -> what the networks see (B, s_dim + z_dim) and by how
@@ -552,6 +553,10 @@ class Actor(nn.Module):
     @torch.no_grad()
     def act(self, s, z, deterministic=False):
         """The action (B, a_dim) for the robot's own motors."""
+        if self.told.numel():  # an asked speed -> the one to tell the policy, which would be late otherwise
+            asked, tell = self.told
+            at = ((z[:, 0] - asked[0]) / (asked[1] - asked[0])).clamp(0, len(asked) - 1.001)
+            z = torch.cat([torch.lerp(tell[at.long()], tell[at.long() + 1], at.frac())[:, None], z[:, 1:]], 1)
         x, turns = self.inputs(s, z)
         action, _ = self(x, deterministic)
         return self.seen(action, -turns)
@@ -566,6 +571,7 @@ def load_actor(content):
     a_dim, hidden, s_dim = len(state["net.4.bias"]) // 2, len(state["net.0.bias"]), len(state["s_mean"])
     decoder = load_decoder(content) if "decoder.axes" in state else None
     actor = Actor(s_dim, state["net.0.weight"].shape[1] - s_dim, a_dim, hidden, decoder)
+    actor.told = state["told"].clone()  # its length is free
     actor.load_state_dict(state)
     return actor.requires_grad_(False)
 

@@ -39,7 +39,8 @@ def tables():
     for (experiment, labels, factor), rows in groups.items():
         purity, corr, gaps = (np.array([float(r[k]) for r in rows if r[k]]) for k in ("purity", "abs_corr", "largest_gap_deg"))
         low, high = common.bootstrap_interval(purity)
-        name = {"none": "trajectory VAE", "circle": "circle", "own": "own axes"}.get(labels, "Gaussian axis" if experiment == "full" else "WET-VAE")
+        name = {"none": "trajectory VAE", "circle": "circle", "plain": "Eq. 4 as printed"}.get(labels, "WET-VAE")
+        name = "Gaussian axis" if (experiment, labels) == ("full", "full") else name
         empty = f"{gaps.mean():.1f}°, {gaps.max():.1f}°" if len(gaps) else "–"
         seeds.append(f"| {experiment}, {name} | {factor} | {purity.mean():.3f} | {low:.3f} .. {high:.3f} | {purity.min():.3f} "
                      f"({rows[purity.argmin()]['seed']}) | {corr.mean():.2f} | {empty} | {len(rows)} |")

@@ -17,7 +17,7 @@ S1, S2, S3, S4 = "01_make_dataset", "02_train_wetvae", "03_train_policy", "04_mp
 TINY_DATA = ["--trajectories", 1500]
 TINY_VAE = ["--batch", 200, "--held_out", 500, "--epochs", 36, "--checkpoint", 0, "--baseline", "false", "--hidden", 32, "--threads", 1]
 TINY_POLICY = ["--updates", 128, "--reports", 8, "--warm_up", 500, "--replay", 1000, "--hidden", 32, "--coverage", 2,
-               "--checkpoint", 0, "--threads", 1]
+               "--checkpoint", 0, "--threads", 1, "--calibrated", 0]
 
 
 def versions(fork, file, number):
