@@ -721,7 +721,8 @@ if __name__ == "__main__":
     actor.told = told
     print()
     if told.numel():
-        print(f"as trained: tracking error {error_as_trained:.3f}, achieved/commanded {' '.join(f'{v:.2f}' for v in ratio)}; with speeds calibrated:")
+        print(f"as trained: tracking error {error_as_trained:.3f}, achieved/commanded {' '.join(f'{v:.2f}' for v in ratio)}; "
+              "with speeds calibrated:")
     executed, commanded, flipped = grid_run(actor, decoder)
     error, degrees, ratio = tracking(executed, commanded)
     torch.manual_seed(SEED)
