@@ -494,8 +494,9 @@ def measure_baseline(actor, policy, method, skills):
         part.load_state_dict(policy[name])
     found = dict(metric_first=policy["curve"][0]["metric"], metric_last=policy["curve"][-1]["metric"])
     if METHOD == "dads":  # R^2: of what moves the robot, how much skill dynamics tell better than a constant
+        track = paths(actor, skills, 1, EPISODE, None)
         for hold in (1, 20, HOLD):
-            executed = np.diff(paths(actor, skills, 1, EPISODE, None)[:, ::hold], axis=1)
+            executed = np.diff(track[:, ::hold], axis=1)
             miss = executed - hold * STEP_SCALE * predict(method.decoder, skills, 1).numpy()
             found[f"r2_of_{hold}_steps"] = 1 - (miss ** 2).sum() / ((executed - executed.mean((0, 1))) ** 2).sum()
         return found
@@ -751,8 +752,8 @@ if __name__ == "__main__":
     if METHOD != "wedis":
         extra = measure_baseline(actor, policy, method, skills)
         print(f"{method.metric}: " + ", ".join(f"{what} {value:.3f}" for what, value in extra.items()))
-        update_csv(Path(OUT) / "results" / "baselines.csv",
-                   [dict(method=EXPERIMENT.removeprefix("ant_"), seed=SEED, what=what, value=value) for what, value in extra.items()], ("method", "seed", "what"))
+        rows = [dict(method=EXPERIMENT.removeprefix("ant_"), seed=SEED, what=what, value=value) for what, value in extra.items()]
+        update_csv(Path(OUT) / "results" / "baselines.csv", rows, ("method", "seed", "what"))
     slow, mid, fast = by_speed(ratio)
     update_csv(Path(OUT) / "results" / "policies.csv", [dict(
         experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy["updates"], env_steps=policy["env_steps"],
