@@ -718,13 +718,14 @@ if __name__ == "__main__":
             print(f"  on the robot (T = 5, H_z = 40): weight {w:.3f} ends {away:.2f} m from the decoder's path of {size:.1f} m")
 
     told, actor.told = actor.told, torch.zeros(2, 0)
-    error_as_trained, *_, ratio = tracking(*grid_run(actor, decoder)[:2])
+    executed, commanded, flipped = grid_run(actor, decoder)
+    error_as_trained, *_, ratio = tracking(executed, commanded)
     actor.told = told
     print()
     if told.numel():
         print(f"as trained: tracking error {error_as_trained:.3f}, achieved/commanded {' '.join(f'{v:.2f}' for v in ratio)}; "
               "with speeds calibrated:")
-    executed, commanded, flipped = grid_run(actor, decoder)
+        executed, commanded, flipped = grid_run(actor, decoder)
     error, degrees, ratio = tracking(executed, commanded)
     torch.manual_seed(SEED)
     error_sampled, *_ = tracking(*grid_run(actor, decoder, deterministic=False)[:2])
