@@ -1,4 +1,5 @@
-"""Stage 3: decoder -> skill policy pi(a | s, z_single), trained by SAC on single steps (Sec. 4.2, App. A.1.3).
+"""Stage 3: decoder -> skill policy pi(a | s, z_single), trained by SAC on single steps (Sec. 4.2, App. A.1.3); and the baselines of Fig 5
+and 7, DADS and SeCTAR, by the same loop: a method is where skills come from, what a transition is worth, and what else learns.
 
 Reads runs/wetvae_*.pt. The reward is the decoder's log-likelihood of the step just made (Eq. 6), computed when a batch is
 sampled, so that any stored step can be relabelled with a fresh skill. Writes runs/policy_<experiment>_seed<seed>.pt,
@@ -6,8 +7,10 @@ Fig 5 (15, 16), the learning curve (figures/, results/) and a row of results/pol
 Takes 45 minutes on one core (45 updates/s; AMD EPYC 7003, no AVX-512). Expect, n = 1 (seed 0): tracking error 0.18 with mean and
 0.22 with sampled actions, direction error 4.3 degrees, middle and fast skills at 0.85 and 0.90 of their speed, slow ones at 0.33.
 """
+import copy
 import math
 import time
+from itertools import combinations, permutations
 from pathlib import Path
 
 import mujoco
@@ -16,8 +19,8 @@ import torch
 from torch import nn
 
 import common
-from common import (Actor, Robots, ant_spec, artifact_name, check_same, cross_talk, egocentric, execute, factors_of, first_step, load,
-                    load_actor, load_decoder, parse_flags, plt, predict, resumable, save, save_figure, stop, update_csv)
+from common import (Actor, Decoder, Robots, SkillDynamics, ant_spec, artifact_name, check_same, cross_talk, egocentric, execute,
+                    factors_of, first_step, load, load_actor, load_decoder, parse_flags, plt, predict, resumable, save, save_figure, stop, update_csv)
 
 EXPERIMENT = "ant_semi"  # row of EXPERIMENTS below
 SEED = 0                 # random seed
@@ -32,10 +35,15 @@ REPORTS = 40             # printed lines and points of the learning curve
 
 DECODER = "main"         # experiment of 02 whose decoder is the reward
 DECODER_SEED = 0         # and its seed
-METHOD = "wedis"         # named in results/
+METHOD = "wedis"         # wedis, dads or sectar
 ROBOT = "ant"            # ant or half_cheetah
 STEP_SCALE = 0.1         # metres per trajectory unit, App. A.1.3: 1/10, Half-Cheetah 1/5
 DIRECTIONS = 5           # of the tracking grid: from -1.5 to 1.5 of z_dir
+AXES = 3                 # entries of z: speed, direction, curvature; Half-Cheetah 2, DADS 2, SeCTAR 8
+Z_RANGE = 1.5            # ends of a traversed axis
+HOLD = 100               # H_z of the tracking error
+LENGTH = 1               # T of the tracking error
+PROFILE = 40             # H_z at which executed factors are measured, T = 5
 
 ROBOTS = 64              # environments that step together
 EPISODE = 200            # steps until a robot starts anew; not terminal: the value beyond is bootstrapped
@@ -49,6 +57,7 @@ RELABELLED = 0.5         # share of a batch given a fresh skill from the prior (
 EGOCENTRIC = True        # the networks see state and wanted step from the torso, up to quarter turns (false: s and z, the paper)
 HIDDEN = 256             # width of the two hidden layers (the paper: 512)
 LEARNING_RATE = 1e-3     # Adam, decays linearly to 0 over the second half (the paper: 3e-4, fixed)
+AVERAGED = 0.002         # rate of the average over the actor's weights that is measured and kept; 1: the actor itself
 DISCOUNT = 0.97          # gamma of Eq. 1 (the paper: 0.99)
 SMOOTHING = 0.01         # of the target value network, App. A.1.3
 REWARD_SCALE = 0.1       # the paper: 1
@@ -57,6 +66,14 @@ VARIANCE_SCALE = 0.05    # decoder variance -> square metres, App. A.1.3: 1/20
 FLOOR_START = 0.04       # metres, least standard deviation of the reward: a sharp one makes standing still a trap
 FLOOR_END = 0.01         # shrinks to this between 0.15 and 0.6 of the updates: teaches the slow skills
 
+RECENT = 0               # latest steps that a baseline's model learns from, once in UPDATES_PER_STEP updates
+MODEL_BATCH = 0          # steps (DADS) or trajectories (SeCTAR) in a batch of theirs
+PRIOR_SAMPLES = 100      # L of DADS's reward
+EXPLORE = 0.3            # SeCTAR: share of trajectories that are the explorer's (0: no explorer)
+KL_WEIGHT = 2.0          # SeCTAR
+CLONING = 100.0          # SeCTAR: weight of behaviour cloning
+VAE_SCALE = 0.01         # of SeCTAR's loss beside SAC's; Adam does not notice, but for the actor: cloning against reward
+
 CALIBRATED = 8           # starts at each of 33 speeds from which told speeds are calibrated; 0: not (the paper)
 TRAVERSAL = 25           # skills on each axis at which executed purity and the relation function are measured
 COVERAGE = 200           # random skills whose visited cells of 1 m are counted at the end
@@ -64,8 +81,15 @@ COVERAGE = 200           # random skills whose visited cells of 1 m are counted 
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
     "ant_semi": {},
     "ant_full": dict(DECODER="full_circle", DIRECTIONS=16),                                                            # Fig 15
-    "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, EGOCENTRIC=False),                 # Fig 16
+    "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, EGOCENTRIC=False, AXES=2),         # Fig 16
+    "ant_dads": dict(METHOD="dads", EGOCENTRIC=False, AXES=2, Z_RANGE=1.0, PROFILE=40, SKILL_STEPS=200, RECENT=10_000, MODEL_BATCH=256,
+                     TEMPERATURE=0.01),  # the published 0.1 at our reward scale
+    "ant_sectar": (SECTAR := dict(METHOD="sectar", EGOCENTRIC=False, AXES=8, LENGTH=50, HOLD=1, PROFILE=10, SKILL_STEPS=50, RECENT=128_000,
+                                  MODEL_BATCH=64, TEMPERATURE=0.003)),
+    "ant_sectar_no_explorer": SECTAR | dict(EXPLORE=0.0),  # what the explorer is good for
 }
+FACTORS = dict(speed=1.0, direction=2 * math.pi, curvature=math.pi / 3)  # of which the baselines' axes know nothing: full ranges, Table 1
+EXPLORER = 3.0           # every entry of the z that means "explore" to SeCTAR's policy: far from N(0, I), and no plan asks for it
 
 
 def half_cheetah_spec():
@@ -138,6 +162,141 @@ def reward(mean, log_var, displacement, floor):
     return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * mean) ** 2 / variance).sum(1)
 
 
+class Wedis:
+    """Skills from the prior; a step is worth the decoder's log-likelihood (Eq. 6); the decoder is trained already."""
+    model, metric = nn.ModuleDict(), None
+
+    def __init__(self, decoder):
+        self.decoder, self.z_dim, self.span = decoder, AXES - 1, 1  # span: steps that are judged together
+
+    def sample(self, n):
+        return torch.randn(n, self.z_dim)
+
+    def reward(self, displacement, t, z, floor):
+        step, log_var = first_step(self.decoder, z)
+        return reward(step, log_var, displacement[:, 0], floor), step
+
+    def loss(self, s, a, displacement, z, actor):
+        return torch.zeros(())
+
+
+class Dads:
+    """Sharma et al. 2019. Skills z ~ U(-1, 1)^2; a step is worth its mutual information with z under q(displacement | z); q learns.
+
+    The reward is computed anew for each batch, with the q of now, so that old steps and relabelled ones can be used (off-policy DADS)."""
+    metric = "mutual information (nats)"
+
+    def __init__(self):
+        self.decoder, self.z_dim, self.span = SkillDynamics(AXES), AXES, 1
+        self.model = nn.ModuleDict(dict(decoder=self.decoder))
+
+    def sample(self, n):
+        return torch.rand(n, self.z_dim) * 2 - 1
+
+    def information(self, displacement, z):
+        """log(L + 1) - log(1 + sum_i exp(log q(.|z_i) - log q(.|z))), (B,), of displacements (B, 2) in metres. The L prior samples are
+        the same for all B: q reads z alone, so that they cost L evaluations and not L B."""
+        x = (displacement / STEP_SCALE - self.decoder.x_mean) / self.decoder.x_std
+        own = self.decoder.log_prob(x, *self.decoder.mixture(z))
+        others = self.decoder.log_prob(x[:, None], *self.decoder.mixture(self.sample(PRIOR_SAMPLES)))
+        return math.log(PRIOR_SAMPLES + 1) - (1 + (others - own[:, None]).clamp(-50, 50).exp().sum(1)).log()
+
+    def reward(self, displacement, t, z, floor):
+        return REWARD_SCALE * self.information(displacement[:, 0], z), None
+
+    def loss(self, s, a, displacement, z, actor):
+        """-log q of recent steps under the skills that made them (never under relabelled ones: q would learn that z means nothing)."""
+        x = displacement[:, 0] / STEP_SCALE
+        self.decoder.x_mean.lerp_(x.mean(0), 0.02), self.decoder.x_std.lerp_(x.std(0), 0.02)  # q's unit deviation is in these units
+        return -self.decoder.log_prob((x - self.decoder.x_mean) / self.decoder.x_std, *self.decoder.mixture(z[:, 0])).mean()
+
+    def measure(self, displacement, z):
+        return self.information(displacement[:, 0], z[:, 0]).mean().item()
+
+
+class Encoder(nn.Module):
+    """q_phi(z | tau) of SeCTAR: a bidirectional LSTM over displacements (B, T, 2), mean-pooled. Returns mean, log-variance (B, AXES)."""
+
+    def __init__(self, hidden=64):
+        super().__init__()
+        self.lstm, self.head = nn.LSTM(2, hidden, bidirectional=True, batch_first=True), nn.Linear(2 * hidden, 2 * AXES)
+
+    def forward(self, x):
+        return self.head(self.lstm(x)[0].mean(1)).chunk(2, 1)
+
+
+class Sectar:
+    """Co-Reyes et al. 2018. Skills z ~ N(0, I) for SKILL_STEPS steps; a step is worth the state decoder's log-likelihood of it. Encoder,
+    state decoder and, by cloning, the policy learn from the robots' own trajectories. The explorer is the same policy, told EXPLORER
+    instead of a skill, and worth the negative ELBO; skills begin where it ends, and it learns from their trajectories too."""
+    metric = "reconstruction error"
+
+    def __init__(self):
+        self.decoder, self.encoder, self.z_dim, self.span = Decoder(AXES), Encoder(), AXES, SKILL_STEPS
+        self.model = nn.ModuleDict(dict(decoder=self.decoder, encoder=self.encoder))
+
+    def sample(self, n):
+        return torch.where(torch.rand(n, 1) < EXPLORE, EXPLORER, torch.randn(n, self.z_dim))
+
+    def posterior(self, x):
+        """Displacements x (B, T, 2) in trajectory units -> a sample of q(z | tau) (B, AXES), its KL divergence from the prior (B,)."""
+        mean, log_var = self.encoder(x)
+        return mean + (0.5 * log_var).exp() * torch.randn_like(mean), 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1)
+
+    def decode(self, z, floor):
+        """Mean and log-variance (B, SKILL_STEPS, 2) in trajectory units. Without a floor the likelihood of standing still has no bound."""
+        mean, log_var = self.decoder.unroll(z, SKILL_STEPS)
+        return mean, log_var.clamp(min=2 * math.log(floor / STEP_SCALE))
+
+    def reward(self, displacement, t, z, floor):
+        """displacement (K, T, 2) of whole trajectories, t (n, K): the steps of each that are asked for, z (K, AXES) -> (n K,)."""
+        x, explorer, i, kl = displacement / STEP_SCALE, z[:, 0] == EXPLORER, torch.arange(len(z)), torch.zeros(len(z))
+        if explorer.any():
+            z = z.clone()
+            z[explorer], kl[explorer] = self.posterior(x[explorer])
+        mean, log_var = self.decode(z, FLOOR_END)
+        x, mean, log_var = x[i, t], mean[i, t], log_var[i, t]
+        surprise = 0.5 * (log_var + math.log(2 * math.pi) + (x - mean) ** 2 / log_var.exp()).sum(2) + KL_WEIGHT * kl / SKILL_STEPS
+        # of a skill less its value at the mean, as WEDIS's: what depends on z and t alone does not change what is best
+        follow = -0.5 * ((x - mean) ** 2 / log_var.exp().clamp(min=(floor / STEP_SCALE) ** 2)).sum(2)
+        return REWARD_SCALE * torch.where(explorer, surprise.clamp(max=20), follow).flatten(), None
+
+    def elbo(self, x):
+        """Displacements (B, T, 2) in trajectory units -> sum_t log p(x_t | z), KL(q || p), both (B,), and z (B, AXES) ~ q."""
+        z, kl = self.posterior(x)
+        mean, log_var = self.decode(z, FLOOR_END)
+        return -0.5 * (log_var + math.log(2 * math.pi) + (x - mean) ** 2 / log_var.exp()).sum((1, 2)), kl, z
+
+    def loss(self, s, a, displacement, z, actor):
+        """Negative ELBO of recent trajectories and cloning of eight actions of each, by the policy told q's z. It reaches the encoder too."""
+        log_p, kl, z = self.elbo(displacement / STEP_SCALE)
+        i, t = torch.arange(len(z))[:, None], torch.randint(SKILL_STEPS, (len(z), 8))
+        x, _ = actor.inputs(s[i, t].flatten(0, 1), z.repeat_interleave(8, 0))
+        action, _ = actor(x, deterministic=True)
+        miss = 0.5 * ((action - a[i, t].flatten(0, 1)) ** 2).sum(1)
+        return VAE_SCALE * ((KL_WEIGHT * kl - log_p).mean() + CLONING * miss.mean())
+
+    def reconstruction_error(self, x):
+        """Displacements (B, T, 2) in trajectory units -> RMS over all places of (decoded from q's mean - executed) / RMS executed."""
+        path = x.cumsum(1)
+        return ((self.decode(self.encoder(x)[0], FLOOR_END)[0].cumsum(1) - path).square().mean() / path.square().mean()).sqrt().item()
+
+    def measure(self, displacement, z):
+        return self.reconstruction_error(displacement / STEP_SCALE)
+
+
+METHODS = dict(wedis=Wedis, dads=Dads, sectar=Sectar)
+
+
+def trajectories(n, span, env_steps, replay, recent):
+    """Rows of replay (n, span) of n random trajectories of `span` steps, complete ones among the `recent` latest steps. A step of all
+    robots is ROBOTS rows, so a robot's next step is ROBOTS rows on; trajectories begin together (or span is 1)."""
+    block = ROBOTS * span
+    done, kept = env_steps // block, len(replay) // block
+    back = torch.randint(max(1, min(done, kept - 1, recent // block)), (n,))  # kept - 1: one is being overwritten
+    return (((done - 1 - back) % kept * block + torch.randint(ROBOTS, (n,)))[:, None] + ROBOTS * torch.arange(span))
+
+
 def sac_losses(actor, critics, value, target, x, a, x2, r):
     """Losses of the actor, the twin critics and the value network (Haarnoja et al. 2018). x, x2 (B, n): state and skill
     before and after the step; a (B, m); r (B,). Every step is followed by another: time limits are not terminal."""
@@ -162,7 +321,10 @@ def make_robots(n):
 
 def grid():
     """DESIGN's tracking grid. Ant: 5 speeds x DIRECTIONS in [-1.5, 1.5] (a full circle's ends are one direction), (n, 3);
-    Half-Cheetah: 8 speeds in [-1, 1] (Fig 16), (8, 2)."""
+    Half-Cheetah: 8 speeds in [-1, 1] (Fig 16), (8, 2). DADS: 5 x 5 in its square; SeCTAR, of eight axes: 25 fixed draws from the prior."""
+    if METHOD != "wedis":
+        return (torch.cartesian_prod(*[torch.linspace(-1, 1, 5)] * 2) if METHOD == "dads" else
+                torch.randn(25, AXES, generator=torch.Generator().manual_seed(0)))
     if ROBOT != "ant":
         return nn.functional.pad(torch.linspace(-1, 1, 9)[torch.arange(9) != 4][:, None], (0, 1))
     directions = torch.linspace(-1.5, 1.5, DIRECTIONS) if EXPERIMENT != "ant_full" else 3 * torch.arange(DIRECTIONS) / DIRECTIONS - 1.5
@@ -170,17 +332,19 @@ def grid():
 
 
 def grid_run(actor, decoder, deterministic=True):
-    """The tracking grid walked for 100 steps from rest at H_z = 100. Returns executed and predicted end points (n, 2 or 1) in metres
-    and which robots were ever upside down (n,)."""
+    """The tracking grid walked from rest for LENGTH skills' steps T of HOLD steps H_z. Returns executed and predicted end points (n, 2 or
+    1) in metres, of the baselines from the shortest prediction to the longest, and which robots were ever upside down (n,)."""
     z = grid()
     robots, flipped = make_robots(len(z)), np.zeros(len(z), bool)
-    for _ in execute(actor, robots, z, 1, 100, 0.0, deterministic):
+    for _ in execute(actor, robots, z, LENGTH, HOLD, 0.0 if METHOD == "wedis" else None, deterministic):
         if ROBOT == "ant":
             x, y = robots.qpos[:, 4:6].T  # of the torso's quaternion; its up-vector has height 1 - 2 (x^2 + y^2)
             flipped |= 1 - 2 * (x ** 2 + y ** 2) < 0
         else:
             flipped |= np.cos(robots.qpos[:, 2]) < 0
-    return robots.qpos[:, :robots.place].copy(), (100 * STEP_SCALE * predict(decoder, z, 1)[:, 0]).double().numpy(), flipped
+    predicted = (HOLD * STEP_SCALE * predict(decoder, z, LENGTH).sum(1)).double().numpy()
+    order = slice(None) if METHOD == "wedis" else np.argsort((predicted ** 2).sum(1))
+    return robots.qpos[:, :robots.place][order].copy(), predicted[order], flipped
 
 
 def tracking(executed, predicted):
@@ -201,18 +365,18 @@ def by_speed(values):
     return [float(part.mean()) for part in np.split(values, [n, len(values) - n])]
 
 
-def paths(actor, z, steps, hold, weight):
-    """Executed positions (n, steps * hold + 1, 2 or 1) in metres of skills z (n, M) from rest, mean actions."""
+def paths(actor, z, steps, hold, weight, deterministic=True):
+    """Executed positions (n, steps * hold + 1, 2 or 1) in metres of skills z (n, M) from rest, mean actions unless told."""
     robots = make_robots(len(z))
     track = [robots.qpos[:, :robots.place].copy()]
-    for _ in execute(actor, robots, z, steps, hold, weight, deterministic=True):
+    for _ in execute(actor, robots, z, steps, hold, weight, deterministic):
         track.append(robots.qpos[:, :robots.place].copy())
     return np.stack(track, 1)
 
 
 def traversal(axis, values):
     """Skills with one axis at values, the others at 0; acceleration at z_speed = -1, because it is nothing where speed is."""
-    z = torch.zeros(len(values), 3 if ROBOT == "ant" else 2)
+    z = torch.zeros(len(values), AXES)
     if ROBOT != "ant" and axis == 1:
         z[:, 0] = -1
     z[:, axis] = torch.as_tensor(values, dtype=torch.float32)
@@ -267,9 +431,9 @@ def calibrate_speeds(actor, decoder):
 
 
 def draw_skills(actor, decoder, weight, name, columns):
-    """Fig 5 (WEDIS), 15, 16: predicted (top) and executed (bottom) skills; a column per (axis, values, T, H_z). In one dimension the
+    """Fig 5, 15, 16: predicted (top) and executed (bottom) skills; a column per (axis, values, T, H_z). In one dimension the
     latent is on the y axis and time steps have colours."""
-    figure, axes = plt.subplots(2, len(columns), figsize=(3.2 * len(columns), 6.4))
+    figure, axes = plt.subplots(2, len(columns), figsize=((3.2 if len(columns) < 5 else 2.4) * len(columns), 6.4))
     for column, (title, axis, values, steps, hold) in enumerate(columns):
         z = traversal(axis, values)
         predicted = np.pad(hold * STEP_SCALE * predict(decoder, z, steps).numpy().cumsum(1), ((0, 0), (1, 0), (0, 0)))
@@ -284,9 +448,9 @@ def draw_skills(actor, decoder, weight, name, columns):
             colours = plt.get_cmap("twilight_shifted" if len(values) > 5 else common.TRAVERSAL_MAP)(np.linspace(0, 0.95, len(values)))
             for i, value in enumerate(values):
                 colour = common.LATENT_COLOURS.get(value, colours[i])
-                axes[0, column].plot(*predicted[i].T, "o-", ms=3, color=colour, label=f"{value:g}")
+                axes[0, column].plot(*predicted[i].T, "o-", ms=3 if hold > 1 else 1, color=colour, label=f"{value:g}")
                 axes[1, column].plot(*executed[i].T, color=colour)
-                axes[1, column].plot(*executed[i, ::hold].T, "o", ms=3, color=colour)
+                axes[1, column].plot(*executed[i, ::hold].T, "o", ms=3 if hold > 1 else 1, color=colour)
             low, high = both.min((0, 1)) - 1, both.max((0, 1)) + 1
             for ax in axes[:, column]:  # one scale for both rows, or the eye is fooled
                 ax.set(xlim=(low[0], high[0]), ylim=(min(-3, low[1]), max(3, high[1])))
@@ -301,8 +465,8 @@ def draw_skills(actor, decoder, weight, name, columns):
 
 
 def draw_learning_curve(curve):
-    """Tracking error and achieved speeds against the minutes of training."""
-    figure, (error, returns) = plt.subplots(1, 2, figsize=(8, 3))
+    """Tracking error and achieved speeds, of a baseline also its own metric, against the minutes of training."""
+    figure, (error, returns, *own) = plt.subplots(1, 3 if "metric" in curve[0] else 2, figsize=(12 if "metric" in curve[0] else 8, 3))
     minutes = [row["minutes"] for row in curve]
     error.plot(minutes, [row["tracking_error"] for row in curve], ".-", color=common.BLUE)
     error.set(xlabel=f"minutes of training ({THREADS} thread{'s' * (THREADS > 1)})", ylabel=f"tracking error ({len(grid())} skills)", ylim=(0, 1.1))
@@ -311,7 +475,48 @@ def draw_learning_curve(curve):
     returns.axhline(1, color="black", lw=0.8, ls="--")
     returns.set(xlabel=error.get_xlabel(), ylabel="achieved / commanded speed", ylim=(-0.1, 1.3))
     returns.legend()
+    for ax in own:
+        ax.plot(minutes, [row["metric"] for row in curve], ".-", color=common.BLUE)
+        ax.set(xlabel=error.get_xlabel(), ylabel=f"{METHODS[METHOD].metric}, recent steps")
     save_figure(figure, OUT, f"learning_curve_{EXPERIMENT}")
+
+
+def match(C):
+    """Best one-to-one matching of axes (A, rows) to factors (columns) by the cross-talk: the pairs whose purities sum to most. Of fewer
+    axes than factors some factors have none, of more each has its best. Returns {factor: (axis, purity)}, by number."""
+    share, n = C / C.sum(1, keepdims=True), min(C.shape)
+    axes, factors = max(((a, f) for a in permutations(range(len(C)), n) for f in combinations(range(C.shape[1]), n)),
+                        key=lambda pairing: share[pairing].sum())
+    return {f: (a, share[a, f]) for a, f in zip(axes, factors)}
+
+
+def measure_baseline(actor, policy, method, skills):
+    """What DADS and SeCTAR have beyond WEDIS's measures: {what: value}. skills (n, AXES), drawn from the prior."""
+    for name, part in method.model.items():
+        part.load_state_dict(policy[name])
+    found = dict(metric_first=policy["curve"][0]["metric"], metric_last=policy["curve"][-1]["metric"])
+    if METHOD == "dads":  # R^2: of what moves the robot, how much skill dynamics tell better than a constant
+        track = paths(actor, skills, 1, EPISODE, None)
+        for hold in (1, 20, HOLD):
+            executed = np.diff(track[:, ::hold], axis=1)
+            miss = executed - hold * STEP_SCALE * predict(method.decoder, skills, 1).numpy()
+            found[f"r2_of_{hold}_steps"] = 1 - (miss ** 2).sum() / ((executed - executed.mean((0, 1))) ** 2).sum()
+        return found
+    for name, mean_actions in (("", True), ("_sampled", False)):  # new trajectories from rest: the VAE has never seen them
+        track = paths(actor, skills, SKILL_STEPS, 1, None, mean_actions)
+        executed = torch.from_numpy(np.diff(track, axis=1)).float() / STEP_SCALE
+        found["reconstruction_error" + name] = method.reconstruction_error(executed)
+        miss = predict(method.decoder, skills, SKILL_STEPS).cumsum(1) - executed.cumsum(1)
+        found["self_consistency_error" + name] = (miss.square().mean() / executed.cumsum(1).square().mean()).sqrt().item()
+    if EXPLORE:
+        track = paths(actor, torch.full_like(skills, EXPLORER), EPISODE, 1, None, False)
+        found["explorer_coverage_cells"] = cells(track)
+    return found
+
+
+def cells(track):
+    """How many cells of 1 m the paths (n, K, 2 or 1) in metres visit."""
+    return len(np.unique(np.floor(track.reshape(-1, track.shape[2])), axis=0))
 
 
 def draw_robots():
@@ -337,23 +542,26 @@ def draw_robots():
 
 # ---------------------------------------------------------------- training
 
-def train(decoder, config):
-    """Algorithm 1, policy training. Returns what the policy artifact holds."""
+def train(method, config):
+    """Algorithm 1, policy training, of any method. Returns what the policy artifact holds."""
     rng = np.random.default_rng(SEED)
     torch.manual_seed(SEED)
     robots = make_robots(ROBOTS)
-    s_dim, a_dim, z_dim = robots.observe().shape[1], robots.ctrl.shape[1], len(decoder.axes) - 1
-    actor = Actor(s_dim - EGOCENTRIC, z_dim, a_dim, HIDDEN, decoder if EGOCENTRIC else None)
+    s_dim, a_dim, z_dim, span = robots.observe().shape[1], robots.ctrl.shape[1], method.z_dim, method.span
+    actor = Actor(s_dim - EGOCENTRIC, z_dim, a_dim, HIDDEN, method.decoder if EGOCENTRIC else None)
     n_in = actor.net[0].in_features
     critics, value, target = Critics(n_in + a_dim), value_network(n_in), value_network(n_in).requires_grad_(False)
     target.load_state_dict(value.state_dict())
-    networks = nn.ModuleList([actor, critics, value])
+    average = copy.deepcopy(actor).requires_grad_(False)  # of the late weights: single ones swing, and one robot in ten stands still
+    networks = nn.ModuleList([actor, critics, value, method.model])
     optimizer = torch.optim.Adam(networks.parameters(), lr=LEARNING_RATE, fused=True)
 
     columns = (s_dim, a_dim, s_dim, robots.place, z_dim)  # s, a, s', displacement, z; one row a step, so that one gather makes a batch
-    replay = torch.zeros(REPLAY, sum(columns))
-    z = torch.randn(ROBOTS, z_dim)
+    replay = torch.zeros(REPLAY // (ROBOTS * span) * ROBOTS * span, sum(columns))
+    moved = replay[:, -robots.place - z_dim:-z_dim]
+    z = method.sample(ROBOTS)
     age = rng.integers(0, EPISODE, ROBOTS)  # staggered, or all robots would start anew at once
+    age -= age % span
     updates = env_steps = unstable = 0
     seconds, curve = 0.0, []
     robots.reset(np.arange(ROBOTS), rng)
@@ -363,6 +571,7 @@ def train(decoder, config):
         check_same(state, config, set(config) - {"RESUME", "OUT", "THREADS", "CHECKPOINT", "REPORTS", "UPDATES", "MINUTES"})
         networks.load_state_dict(state["networks"])
         target.load_state_dict(state["target"])
+        average.load_state_dict(state["average"])
         optimizer.load_state_dict(state["optimizer"])
         replay[:len(state["replay"])] = state["replay"]
         z, age = state["z"], state["age"].numpy()
@@ -374,19 +583,25 @@ def train(decoder, config):
 
     def checkpoint():
         save(OUT, "policy-checkpoint", EXPERIMENT, SEED, config, networks=networks.state_dict(), target=target.state_dict(),
-             optimizer=optimizer.state_dict(), replay=replay[:min(env_steps, REPLAY)].clone(), z=z, age=torch.from_numpy(age),
+             average=average.state_dict(), optimizer=optimizer.state_dict(), replay=replay[:env_steps].clone(), z=z, age=torch.from_numpy(age),
              updates=updates, env_steps=env_steps, unstable=unstable, seconds=seconds, curve=curve, torch_rng=torch.get_rng_state(),
              robots={k: torch.from_numpy(robots.batch.bind(k).copy()) for k in ("qpos", "qvel", "ctrl", "time", "qacc_warmstart")},
              numpy_rng=rng.bit_generator.state)
 
     def report():
-        error, degrees, ratio = tracking(*grid_run(actor, decoder)[:2])
+        own = {}
+        if method.metric:
+            with torch.no_grad(), torch.random.fork_rng():  # what is measured leaves the training as it is
+                rows = trajectories(500, span, env_steps, replay, RECENT)
+                own["metric"] = method.measure(moved[rows], replay[rows, -z_dim:])
+        error, degrees, ratio = tracking(*grid_run(average, method.decoder)[:2])
         slow, mid, fast = by_speed(ratio)
         curve.append(dict(updates=updates, env_steps=env_steps, minutes=seconds / 60, tracking_error=float(error), reward=r.mean().item(),
-                          direction_deg=float(degrees[2:].mean()), speed_slow=slow, speed_mid=mid, speed_fast=fast))
+                          direction_deg=float(degrees[2:].mean()), speed_slow=slow, speed_mid=mid, speed_fast=fast) | own)
         update_csv(Path(OUT) / "results" / f"learning_curve_{EXPERIMENT}_seed{SEED}.csv", curve, ())
         print(f"{updates:7d} updates {env_steps:8d} steps  tracking error {error:.3f}  direction {degrees[2:].mean():5.1f} deg  speed x "
               f"{slow:.2f} {mid:.2f} {fast:.2f}  reward {r.mean():6.3f}  floor {floor:.3f}  "
+              + "".join(f"{method.metric} {v:.3f}  " for v in own.values()) +
               f"{updates / seconds:4.0f} updates/s  {seconds / 60 * (1 / progress - 1):4.0f} min left", flush=True)
 
     def share_done():
@@ -397,7 +612,7 @@ def train(decoder, config):
         clock, before = time.time(), updates
         # Collect: one step of every robot
         fresh = age % SKILL_STEPS == 0
-        z[fresh] = torch.randn(int(fresh.sum()), z_dim)  # Alg. 1: sample z_single from the prior
+        z[fresh] = method.sample(int(fresh.sum()))  # Alg. 1: sample z_single from the prior
         s = robots.observe()
         if env_steps < WARM_UP:
             a = torch.rand(ROBOTS, a_dim) * 2 - 1
@@ -405,49 +620,55 @@ def train(decoder, config):
             with torch.no_grad():
                 a = actor.act(s, z)
         displacement, failed = robots.step(a.numpy())
-        keep = torch.from_numpy(np.flatnonzero(~failed))
-        rows = torch.cat([s, a, robots.observe(), displacement, z], 1)[keep]
-        replay[torch.arange(env_steps, env_steps + len(rows)) % REPLAY] = rows
-        env_steps += len(rows)
+        rows = torch.arange(env_steps, env_steps + ROBOTS) % len(replay)
+        replay[rows] = torch.cat([s, a, robots.observe(), displacement, z], 1)
+        replay[rows[failed]] = replay[rows[failed] - ROBOTS]  # an unstable step means nothing: the one before is kept once more
+        env_steps += ROBOTS
         unstable += int(failed.sum())
         age += 1
         if len(over := np.flatnonzero((age >= EPISODE) | failed)):
             robots.reset(over, rng)
-            age[over] = 0
+            age %= EPISODE
         if env_steps < WARM_UP:
             seconds += time.time() - clock
             continue
         if not updates:  # state statistics of the random steps, kept from here on
             first = replay[:env_steps, :s_dim]
             if EGOCENTRIC:
-                first, *_ = egocentric(first, next(first_step(decoder, replay[:env_steps, -z_dim:])))
+                first, *_ = egocentric(first, next(first_step(method.decoder, replay[:env_steps, -z_dim:])))
             actor.s_mean.copy_(first.mean(0)), actor.s_std.copy_(first.std(0).clamp(min=1e-3))
+            average.load_state_dict(actor.state_dict())
 
         # Improve: a few updates. What needs no gradient is computed for all of them at once
         floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** min(1, max(0, (progress - 0.15) / 0.45))
         for group in optimizer.param_groups:
             group["lr"] = LEARNING_RATE * min(1, max(0, 2 * (1 - progress)))
-        batch = replay[torch.randint(min(env_steps, REPLAY), (UPDATES_PER_STEP * BATCH,))]
-        s, a, s2, displacement, skill = batch.split(columns, 1)
+        s, a, _, displacement, skill = replay[trajectories(MODEL_BATCH, span, env_steps, replay, RECENT)].split(columns, 2)
+        model_loss = method.loss(s, a, displacement, skill, actor)
+        share = min(span, 2 * UPDATES_PER_STEP)  # steps of a trajectory in the batch, two in each update: decoded and relabelled once
+        rows = trajectories(UPDATES_PER_STEP * BATCH // share, span, env_steps, replay, len(replay))
+        t, skill = torch.randint(span, (share, len(rows))), replay[rows[:, 0], -z_dim:]
         fresh = torch.rand(len(skill)) < RELABELLED
-        skill[fresh] = torch.randn(int(fresh.sum()), z_dim)  # a copy: replay keeps its own
+        skill[fresh] = method.sample(int(fresh.sum()))  # a copy: replay keeps its own
+        s, a, s2, _, _ = replay[rows[torch.arange(len(rows)), t].flatten()].split(columns, 1)
         with torch.no_grad():
-            step, log_var = first_step(decoder, skill)
-            r = reward(step, log_var, displacement, floor)
+            r, step = method.reward(moved[rows], t, skill, floor)
+            skill = skill.repeat(share, 1)
             x, turns = actor.inputs(s, skill, step)
             x2, _ = actor.inputs(s2, skill, step)
             a = actor.seen(a, turns)
-        for small in zip(*(v.split(BATCH) for v in (x, a, x2, r))):
+        for i, small in enumerate(zip(*(v.split(BATCH) for v in (x, a, x2, r)))):
             losses = sac_losses(actor, critics, value, target, *small)
             optimizer.zero_grad()
-            sum(losses).backward()  # the three touch disjoint parameters
+            (sum(losses) + (model_loss if i == 0 else 0)).backward()  # SAC's three touch disjoint parameters
             optimizer.step()
             torch._foreach_lerp_(list(target.parameters()), list(value.parameters()), SMOOTHING)
+            torch._foreach_lerp_(list(average.net.parameters()), list(actor.net.parameters()), AVERAGED)
             updates += 1
         seconds += time.time() - clock
         progress = share_done()
 
-        for name, metric in zip(("actor loss", "critic loss", "value loss", "reward"), (*losses, r.mean())):
+        for name, metric in zip(("actor loss", "critic loss", "value loss", "model loss", "reward"), (*losses, model_loss, r.mean())):
             if not math.isfinite(metric.item()):
                 stop(f"{name} is {metric.item()} after {updates} updates; nothing was overwritten: go on from the last good "
                      f"{artifact_name('policy-checkpoint', EXPERIMENT, SEED)} with --resume true, or lower --learning_rate", code=1)
@@ -459,51 +680,72 @@ def train(decoder, config):
     checkpoint()
     if unstable:
         print(f"{unstable} steps were unstable in MuJoCo: those robots were reset, the steps thrown away")
-    return dict(actor=actor.state_dict(), curve=curve, updates=updates, env_steps=env_steps, seconds=seconds)
+    parts = dict(actor=average, decoder=method.decoder) | dict(method.model.items())
+    return dict({name: part.state_dict() for name, part in parts.items()}, curve=curve, updates=updates, env_steps=env_steps, seconds=seconds)
 
 
 if __name__ == "__main__":
     config = parse_flags(globals())
     torch.set_num_threads(THREADS)
-    decoder_content = load(OUT, "wetvae", DECODER, DECODER_SEED)
-    decoder = load_decoder(decoder_content)
-    weight, miss = calibrate_relation(decoder)
+    if METHOD not in METHODS:
+        stop(f"unknown method {METHOD!r}; allowed: {' '.join(METHODS)}")
+    if METHOD == "wedis":
+        source = load(OUT, "wetvae", DECODER, DECODER_SEED)
+        decoder, names, ranges = load_decoder(source), source["names"], source["ranges"]
+        weight, miss = calibrate_relation(decoder)
+    else:
+        weight, names, ranges = None, list(FACTORS), list(FACTORS.values())
+    torch.manual_seed(SEED)
+    method = Wedis(decoder) if METHOD == "wedis" else METHODS[METHOD]()
     if TRAIN:
-        if not BATCH <= WARM_UP <= REPLAY or not UPDATES:
-            stop(f"--updates must be at least 1 and --warm_up {WARM_UP} must lie between --batch {BATCH} and --replay {REPLAY}")
-        trained = train(decoder, config)
-        if CALIBRATED:
-            trained["actor"]["told"] = calibrate_speeds(load_actor(trained | dict(decoder=decoder_content["decoder"])), decoder)
-        save(OUT, "policy", EXPERIMENT, SEED, config, decoder=decoder_content["decoder"], relation_weight=weight, **trained)
+        least = max(BATCH, ROBOTS * method.span)
+        if not least <= WARM_UP <= REPLAY or not UPDATES or EPISODE % method.span or method.span > 1 and REPLAY < 2 * least:
+            more = f"; for {METHOD} --warm_up must be at least {least}, --replay {2 * least}, and --skill_steps divide --episode"
+            stop(f"--updates must be at least 1 and --warm_up {WARM_UP} must lie between --batch {BATCH} and --replay {REPLAY}"
+                 + more * (method.span > 1))
+        trained = train(method, config)
+        if CALIBRATED and METHOD == "wedis":
+            trained["actor"]["told"] = calibrate_speeds(load_actor(trained), decoder)
+        save(OUT, "policy", EXPERIMENT, SEED, config, relation_weight=weight, **trained)
     policy = load(OUT, "policy", EXPERIMENT, SEED)
-    actor = load_actor(policy)
+    check_same(policy, config, ("METHOD",))
+    actor, decoder = load_actor(policy), load_decoder(policy)
 
-    names, ant = decoder_content["names"], ROBOT == "ant"
-    print(f"\nrelation function, calibrated: z_{names[1 if ant else 0]} {weight:+.3f} {'' if ant else 'sign(z_speed) '}z_{names[-1]}   "
-          f"(the paper, by hand: {0.2 if ant else 0.1} in size)")
-    print(f"  free run of the decoder missed by {miss(weight):.1%} RMS; with the paper's size by {miss(0.2 if ant else 0.1):.1%}, "
-          f"without by {miss(0.0):.1%}")
-    values = np.linspace(-1.5, 1.5, TRAVERSAL)
-    z = traversal(len(names) - 1, values)
-    predicted = 40 * STEP_SCALE * predict(decoder, z, 5).numpy().sum(1)
-    for w in (weight, 0.0):
-        away, size = (np.linalg.norm(v, axis=1).mean() for v in (paths(actor, z, 5, 40, w)[:, -1] - predicted, predicted))
-        print(f"  on the robot (T = 5, H_z = 40): weight {w:.3f} ends {away:.2f} m from the decoder's path of {size:.1f} m")
+    ant, values = ROBOT == "ant", np.linspace(-Z_RANGE, Z_RANGE, TRAVERSAL)
+    if METHOD == "wedis":
+        print(f"\nrelation function, calibrated: z_{names[1 if ant else 0]} {weight:+.3f} {'' if ant else 'sign(z_speed) '}z_{names[-1]}   "
+              f"(the paper, by hand: {0.2 if ant else 0.1} in size)")
+        print(f"  free run of the decoder missed by {miss(weight):.1%} RMS; with the paper's size by {miss(0.2 if ant else 0.1):.1%}, "
+              f"without by {miss(0.0):.1%}")
+        z = traversal(len(names) - 1, values)
+        predicted = 40 * STEP_SCALE * predict(decoder, z, 5).numpy().sum(1)
+        for w in (weight, 0.0):
+            away, size = (np.linalg.norm(v, axis=1).mean() for v in (paths(actor, z, 5, 40, w)[:, -1] - predicted, predicted))
+            print(f"  on the robot (T = 5, H_z = 40): weight {w:.3f} ends {away:.2f} m from the decoder's path of {size:.1f} m")
 
     told, actor.told = actor.told, torch.zeros(2, 0)
-    error_as_trained, *_, ratio = tracking(*grid_run(actor, decoder)[:2])
-    actor.told = told
-    print(f"\nas trained: tracking error {error_as_trained:.3f}, achieved/commanded {' '.join(f'{v:.2f}' for v in ratio)}; with speeds calibrated:")
     executed, commanded, flipped = grid_run(actor, decoder)
+    error_as_trained, *_, ratio = tracking(executed, commanded)
+    actor.told = told
+    print()
+    if told.numel():
+        print(f"as trained: tracking error {error_as_trained:.3f}, achieved/commanded {' '.join(f'{v:.2f}' for v in ratio)}; "
+              "with speeds calibrated:")
+        executed, commanded, flipped = grid_run(actor, decoder)
     error, degrees, ratio = tracking(executed, commanded)
     torch.manual_seed(SEED)
     error_sampled, *_ = tracking(*grid_run(actor, decoder, deterministic=False)[:2])
     accelerating = "acceleration" in names
-    profiles = [np.diff(paths(actor, traversal(i, values), 5, 40, weight)[:, ::40], axis=1) / (40 * STEP_SCALE)
-                for i in range(len(names))]
-    C, purity = cross_talk([factors_of(profile, accelerating) for profile in profiles], names, decoder_content["ranges"])
-    skills = nn.functional.pad(torch.randn(COVERAGE, len(names) - 1), (0, 1))
-    coverage = len(np.unique(np.floor(paths(actor, skills, 1, EPISODE, 0.0).reshape(COVERAGE * (EPISODE + 1), -1)), axis=0))
+    profiles = [np.diff(paths(actor, traversal(i, values), 5, PROFILE, weight)[:, ::PROFILE], axis=1) / (PROFILE * STEP_SCALE)
+                for i in range(AXES)]
+    C, purity = cross_talk([factors_of(profile, accelerating) for profile in profiles], names, ranges)
+    if METHOD == "wedis":
+        skills = nn.functional.pad(torch.randn(COVERAGE, len(names) - 1), (0, 1))
+        purity = dict(zip(names, purity))
+    else:
+        skills = torch.rand(COVERAGE, AXES) * 2 - 1 if METHOD == "dads" else torch.randn(COVERAGE, AXES)
+        purity = {names[f]: p for f, (_, p) in match(C).items()}
+    coverage = cells(paths(actor, skills, 1, EPISODE, None if weight is None else 0.0))
     print(f"tracking error {error:.3f} (mean actions), {error_sampled:.3f} (sampled actions); flips {flipped.sum()} of {len(flipped)}")
     print("from slow to fast")
     print("direction error deg " + " ".join(f"{d:6.1f}" for d in degrees))
@@ -511,20 +753,28 @@ if __name__ == "__main__":
     if accelerating:
         promised = predict(decoder, traversal(1, values), 5).numpy()
         print(f"accelerating skill: speed profile {np.sqrt(((profiles[1] - promised) ** 2).mean() / (promised ** 2).mean()):.3f} from the prediction")
-    print("executed cross-talk, purity: " + "; ".join(f"z_{n} " + " ".join(f"{c:.2f}" for c in row) + f" purity {p:.2f}"
-                                                       for n, row, p in zip(names, C, purity)))
+    print("executed cross-talk: " + "; ".join(f"z_{names[i] if METHOD == 'wedis' else i + 1} " + " ".join(f"{c:.2f}" for c in row)
+                                              for i, row in enumerate(C)) + "; purity " + " ".join(f"{n} {p:.2f}" for n, p in purity.items()))
     print(f"coverage of {COVERAGE} random skills: {coverage} cells of 1 m")
+    if METHOD != "wedis":
+        extra = measure_baseline(actor, policy, method, skills)
+        print(f"{method.metric}: " + ", ".join(f"{what} {value:.3f}" for what, value in extra.items()))
+        rows = [dict(method=EXPERIMENT.removeprefix("ant_"), seed=SEED, what=what, value=value) for what, value in extra.items()]
+        update_csv(Path(OUT) / "results" / "baselines.csv", rows, ("method", "seed", "what"))
     slow, mid, fast = by_speed(ratio)
     update_csv(Path(OUT) / "results" / "policies.csv", [dict(
         experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy["updates"], env_steps=policy["env_steps"],
         train_minutes=policy["seconds"] / 60, tracking_error=error, tracking_error_sampled=error_sampled,
         direction_error_deg=degrees[2:].mean(), speed_ratio_slow=slow, speed_ratio_mid=mid, speed_ratio_fast=fast, flips=int(flipped.sum()),
-        **{f"purity_{n}": dict(zip(names, purity)).get(n, "") for n in ("speed", "direction", "curvature", "acceleration")},
+        **{f"purity_{n}": purity.get(n, "") for n in ("speed", "direction", "curvature", "acceleration")},
         coverage_cells=coverage, tracking_error_as_trained=error_as_trained)], ("experiment", "method", "seed"))
-    five, circle = list(common.LATENT_COLOURS), [round(float(v), 3) for v in grid()[:DIRECTIONS, 1]] if ant else []
+    five, circle = list(common.LATENT_COLOURS), [round(float(v), 3) for v in grid()[:DIRECTIONS, 1]] if METHOD == "wedis" and ant else []
+    latents = [(f"$z_{i + 1}$", i, five, LENGTH, HOLD) for i in range(AXES)]
     draw_skills(actor, decoder, weight, *{
         "ant_semi": ("fig05_skills_wedis", [("$z_{speed}$", 0, five, 1, 100), ("$z_{dir}$", 1, five, 1, 100), ("$z_{cur}$", 2, five, 5, 40)]),
         "ant_full": ("fig15_full_circle", [("$z_{speed}$", 0, five, 1, 100), ("$z_{dir}$", 1, circle, 1, 100)]),
+        "ant_dads": ("fig05_skills_dads", latents), "ant_sectar": ("fig05_skills_sectar", latents),
+        "ant_sectar_no_explorer": ("skills_sectar_no_explorer", latents),
         "half_cheetah": ("fig16_half_cheetah", [("$z_{speed}$", 0, np.linspace(-1, 1, 9), 6, 20), ("$z_{acc}$", 1, np.linspace(-1, 1, 9), 6, 20)]),
     }[EXPERIMENT])
     draw_learning_curve(policy["curve"])

@@ -282,9 +282,10 @@ def spread(values, name):
 def cross_talk(curves, names, ranges):
     """C[i, j] = range of factor j while axis i is traversed / full range of factor j; purity_i = C[i, i] / sum_j C[i, j].
 
-    curves: one dict of factors per axis, in the order of names; ranges: the data's. Returns C (M, M), purity (M,). No encoder."""
+    curves: one dict of factors per axis, in the order of names; ranges: the data's. Returns C (M, M), purity (M,). No encoder.
+    Axes whose factors are not known yet may be more or fewer than names: then only C means something."""
     C = np.array([[spread(curve[name], name) / full for name, full in zip(names, ranges)] for curve in curves])
-    return C, np.diag(C) / C.sum(1)
+    return C, np.diag(C) / C.sum(1)[:len(names)]
 
 
 # ---------------------------------------------------------------- the decoder: predictive model and reward
@@ -326,8 +327,42 @@ class Decoder(nn.Module):
         return self.unroll(self.latents(z), steps)
 
 
+class SkillDynamics(nn.Module):
+    """q_phi(displacement | z) of DADS: a mixture of Gaussians with identity covariance on normalised displacements. The x-y prior slices
+    the place away and nothing else of the state is left: it reads z alone. Displacements in trajectory units."""
+
+    def __init__(self, z_dim=2, x_dim=2, hidden=512, components=4):
+        super().__init__()
+        self.net = nn.Sequential(nn.Linear(z_dim, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
+                                 nn.Linear(hidden, components * (1 + x_dim)))
+        for name, value in (("x_mean", torch.zeros(x_dim)), ("x_std", torch.ones(x_dim)), ("axes", torch.eye(z_dim))):  # axes: see Decoder
+            self.register_buffer(name, value)
+
+    def mixture(self, z):
+        """z (B, m) -> log weights (B, K) and means (B, K, x_dim), normalised."""
+        logit, mean = self.net(z).view(len(z), -1, 1 + len(self.x_mean)).split([1, len(self.x_mean)], 2)
+        return logit.squeeze(2).log_softmax(1), mean
+
+    def log_prob(self, x, log_weight, mean):
+        """log q of normalised x under a mixture: (B, x_dim) -> (B,), each under its own; (B, 1, x_dim) -> (B, L), each under all L."""
+        square = (x[..., None, :] - mean).square().sum(-1)
+        return (log_weight - 0.5 * square).logsumexp(-1) - 0.5 * x.shape[-1] * math.log(2 * math.pi)
+
+    def forward(self, z, steps):
+        """As Decoder: the mean displacement, the same at every step, (B, steps, x_dim); no log-variance, it is a mixture's."""
+        log_weight, mean = self.mixture(z)
+        mean = self.x_mean + self.x_std * (log_weight.exp()[..., None] * mean).sum(1)
+        return mean[:, None].expand(-1, steps, -1), None
+
+
 def load_decoder(content):
+    """The predictive model of an artifact: the Decoder of WEDIS and SeCTAR or the SkillDynamics of DADS."""
     state = content["decoder"]
+    if "x_std" in state:
+        last, x_dim = state["net.4.bias"], len(state["x_mean"])
+        dynamics = SkillDynamics(len(state["axes"]), x_dim, len(state["net.0.bias"]), len(last) // (1 + x_dim))
+        dynamics.load_state_dict(state)
+        return dynamics.requires_grad_(False)
     decoder = Decoder(len(state["axes"]), len(state["head.2.bias"]) // 2, len(state["head.0.bias"]), len(state["circle"]) > 0)
     decoder.load_state_dict(state)
     return decoder.requires_grad_(False)
@@ -544,11 +579,12 @@ def load_actor(content):
 @torch.no_grad()
 def execute(actor, robots, z, steps, hold, weight, deterministic):
     """Alg. 2, execution: hold z_single for `hold` (H_z) environment steps, move it by the relation function, `steps` (T) times.
-    z (n, 3). Yields after each environment step (for contacts, frames and stopping); the robots hold the state."""
+    z (n, M); weight None (DADS, SeCTAR): there is no relation function, the policy is told all of z and z stays. Yields
+    after each environment step (for contacts, frames and stopping); the robots hold the state."""
     for _ in range(steps):
         for _ in range(hold):
-            yield robots.step(actor.act(robots.observe(), single(z), deterministic).numpy())
-        z = next_skill(z, weight)
+            yield robots.step(actor.act(robots.observe(), z if weight is None else single(z), deterministic).numpy())
+        z = z if weight is None else next_skill(z, weight)
 
 
 # ---------------------------------------------------------------- plots
