@@ -58,8 +58,9 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
         ("(a) WET-VAE, T = 1", "main", 1), ("(b) WET-VAE, T = 5", "main", 5), ("(c) WET-VAE, T = 10", "main", 10),
         ("(d) trajectory VAE, T = 5", "main_none", 5)]),
     "seeds": dict(MODELS={"": {}, "plain": PLAIN, "none": NONE}, FIGURE="seeds_wetvae"),
-    "beta_gamma": PLAIN | dict(EPOCHS=12, FIGURE="fig10_beta_gamma", MODELS={f"b{b}_g{g}": dict(BETA=float(b), GAMMA=float(g)) for b, g in BETA_GAMMA},
-                       COLUMNS=[(f"({c}) β = {b}, γ = {g}", f"beta_gamma_b{b}_g{g}", 5) for c, (b, g) in zip("abcde", BETA_GAMMA)]),
+    "beta_gamma": PLAIN | dict(EPOCHS=12, FIGURE="fig10_beta_gamma",
+                               MODELS={f"b{b}_g{g}": dict(BETA=float(b), GAMMA=float(g)) for b, g in BETA_GAMMA},
+                               COLUMNS=[(f"({c}) β = {b}, γ = {g}", f"beta_gamma_b{b}_g{g}", 5) for c, (b, g) in zip("abcde", BETA_GAMMA)]),
     "polar": dict(DATA="polar", LABELS="speed angle", MODELS={"": {}, "none": NONE | dict(FACTORS="speed direction, x y")}),
     "cartesian": dict(DATA="polar", LABELS="x y", FACTORS="x y", FIGURE="fig11_polar_cartesian", COLUMNS=[
         ("polar labels", "polar", 5), ("Cartesian labels", "cartesian", 5), ("no labels", "polar_none", 5)]),

@@ -35,6 +35,7 @@ REPORTS = 40             # printed lines and points of the learning curve
 
 DECODER = "main"         # experiment of 02 whose decoder is the reward
 DECODER_SEED = 0         # and its seed
+TAKEN = ""               # experiment whose egocentric policy is taken as it is, told the steps of this decoder ("": train)
 METHOD = "wedis"         # wedis, dads or sectar
 ROBOT = "ant"            # ant or half_cheetah
 STEP_SCALE = 0.1         # metres per trajectory unit, App. A.1.3: 1/10, Half-Cheetah 1/5
@@ -80,12 +81,13 @@ COVERAGE = 200           # random skills whose visited cells of 1 m are counted 
 
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
     "ant_semi": {},
-    "ant_full": dict(DECODER="full_circle", DIRECTIONS=16),                                                            # Fig 15
+    "ant_full": dict(DECODER="full_circle", DIRECTIONS=16, TAKEN="ant_semi"),                                          # Fig 15
     "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, EGOCENTRIC=False, AXES=2),         # Fig 16
+    # the baselines train by the clock, as long as WEDIS takes
     "ant_dads": dict(METHOD="dads", EGOCENTRIC=False, AXES=2, Z_RANGE=1.0, PROFILE=40, SKILL_STEPS=200, RECENT=10_000, MODEL_BATCH=256,
-                     TEMPERATURE=0.01),  # the published 0.1 at our reward scale
+                     TEMPERATURE=0.01, MINUTES=45.0),  # the published 0.1 at our reward scale
     "ant_sectar": (SECTAR := dict(METHOD="sectar", EGOCENTRIC=False, AXES=8, LENGTH=50, HOLD=1, PROFILE=10, SKILL_STEPS=50, RECENT=128_000,
-                                  MODEL_BATCH=64, TEMPERATURE=0.003)),
+                                  MODEL_BATCH=64, TEMPERATURE=0.003, MINUTES=45.0)),
     "ant_sectar_no_explorer": SECTAR | dict(EXPLORE=0.0),  # what the explorer is good for
 }
 FACTORS = dict(speed=1.0, direction=2 * math.pi, curvature=math.pi / 3)  # of which the baselines' axes know nothing: full ranges, Table 1
@@ -684,6 +686,16 @@ def train(method, config):
     return dict({name: part.state_dict() for name, part in parts.items()}, curve=curve, updates=updates, env_steps=env_steps, seconds=seconds)
 
 
+def take(decoder):
+    """What the policy artifact holds, without training: TAKEN's policy with another decoder in it. It knows wanted steps, not skills."""
+    content = load(OUT, "policy", TAKEN, SEED)
+    if "decoder.axes" not in content["actor"]:
+        stop(f"the policy of {TAKEN} is not egocentric and walks its own skills only; train instead, with --taken ''")
+    state = {name: value for name, value in content["actor"].items() if not name.startswith("decoder.")}
+    state |= {f"decoder.{name}": value for name, value in decoder.state_dict().items()} | dict(told=torch.zeros(2, 0))
+    return content | dict(actor=state, decoder=decoder.state_dict(), curve=[])
+
+
 if __name__ == "__main__":
     config = parse_flags(globals())
     torch.set_num_threads(THREADS)
@@ -703,10 +715,11 @@ if __name__ == "__main__":
             more = f"; for {METHOD} --warm_up must be at least {least}, --replay {2 * least}, and --skill_steps divide --episode"
             stop(f"--updates must be at least 1 and --warm_up {WARM_UP} must lie between --batch {BATCH} and --replay {REPLAY}"
                  + more * (method.span > 1))
-        trained = train(method, config)
+        trained = take(decoder) if TAKEN else train(method, config)
         if CALIBRATED and METHOD == "wedis":
             trained["actor"]["told"] = calibrate_speeds(load_actor(trained), decoder)
-        save(OUT, "policy", EXPERIMENT, SEED, config, relation_weight=weight, **trained)
+        kept = {name: trained[name] for name in ("actor", "decoder", "encoder", "curve", "updates", "env_steps", "seconds") if name in trained}
+        save(OUT, "policy", EXPERIMENT, SEED, config, relation_weight=weight, **kept)
     policy = load(OUT, "policy", EXPERIMENT, SEED)
     check_same(policy, config, ("METHOD",))
     actor, decoder = load_actor(policy), load_decoder(policy)
@@ -777,5 +790,6 @@ if __name__ == "__main__":
         "ant_sectar_no_explorer": ("skills_sectar_no_explorer", latents),
         "half_cheetah": ("fig16_half_cheetah", [("$z_{speed}$", 0, np.linspace(-1, 1, 9), 6, 20), ("$z_{acc}$", 1, np.linspace(-1, 1, 9), 6, 20)]),
     }[EXPERIMENT])
-    draw_learning_curve(policy["curve"])
+    if policy["curve"]:
+        draw_learning_curve(policy["curve"])
     draw_robots()

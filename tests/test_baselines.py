@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import distributions as D
 
-TINY = ["--updates", 32, "--reports", 2, "--robots", 8, "--warm_up", 400, "--replay", 800, "--hidden", 32, "--coverage", 3, "--traversal", 3,
+TINY = ["--minutes", 0, "--updates", 32, "--reports", 2, "--robots", 8, "--warm_up", 400, "--replay", 800, "--hidden", 32, "--coverage", 3, "--traversal", 3,
         "--checkpoint", 0, "--threads", 1]
 BASELINES = {"ant_dads": "dads", "ant_sectar": "sectar"}
 

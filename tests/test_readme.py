@@ -53,7 +53,8 @@ def tables():
         seeds.append(f"| seeds, WET-VAE − trajectory VAE | {factor} | {gap.mean():.3f} | {low:.3f} .. {high:.3f} | {gap.min():.3f} | – | – | "
                      f"{len(gap)} |")
     policies = ["| policy | seed | updates | minutes | tracking error, mean actions | before calibration | sampled | direction error "
-                "| speed ratio slow / middle / fast | flips | executed purity speed / direction / curvature / acceleration | coverage (cells) |", "|---" * 12 + "|"]
+                "| speed ratio slow / middle / fast | flips "
+                "| executed purity speed / direction / curvature / acceleration | coverage (cells) |", "|---" * 12 + "|"]
     for r in results["policies"]:
         ratios = " / ".join(num(r["speed_ratio_" + speed], ".2f") for speed in ("slow", "mid", "fast"))
         purity = " / ".join(num(r[k], ".2f") if r[k] else "–" for k in r if k.startswith("purity_"))
