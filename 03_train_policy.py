@@ -13,14 +13,13 @@ import time
 from itertools import combinations, permutations
 from pathlib import Path
 
+import common  # before mujoco: it chooses how mujoco renders
+from common import (Actor, Decoder, Robots, SkillDynamics, ant_spec, artifact_name, check_same, cross_talk, egocentric, execute,
+                    factors_of, first_step, load, load_actor, load_decoder, parse_flags, plt, predict, resumable, save, save_figure, stop, update_csv)
 import mujoco
 import numpy as np
 import torch
 from torch import nn
-
-import common
-from common import (Actor, Decoder, Robots, SkillDynamics, ant_spec, artifact_name, check_same, cross_talk, egocentric, execute,
-                    factors_of, first_step, load, load_actor, load_decoder, parse_flags, plt, predict, resumable, save, save_figure, stop, update_csv)
 
 EXPERIMENT = "ant_semi"  # row of EXPERIMENTS below
 SEED = 0                 # random seed
@@ -75,8 +74,9 @@ KL_WEIGHT = 2.0          # SeCTAR
 CLONING = 100.0          # SeCTAR: weight of behaviour cloning
 VAE_SCALE = 0.01         # of SeCTAR's loss beside SAC's; Adam does not notice, but for the actor: cloning against reward
 
-CALIBRATED = 8           # starts at each of 33 speeds from which told speeds are calibrated; 0: not (the paper)
-TRAVERSAL = 25           # skills on each axis at which executed purity and the relation function are measured
+CALIBRATED = 16          # starts at each of 33 speeds from which told speeds are calibrated; 0: not (the paper)
+TRAVERSAL = 13           # skills on each axis at which executed purity and the relation function are measured
+STARTS = 16              # noisy starts over which an executed skill is averaged for its purity
 COVERAGE = 200           # random skills whose visited cells of 1 m are counted at the end
 
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
@@ -84,8 +84,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
     "ant_full": dict(DECODER="full_circle", DIRECTIONS=16, TAKEN="ant_semi"),                                          # Fig 15
     "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, EGOCENTRIC=False, AXES=2),         # Fig 16
     # the baselines train by the clock, as long as WEDIS takes
-    "ant_dads": dict(METHOD="dads", EGOCENTRIC=False, AXES=2, Z_RANGE=1.0, PROFILE=40, SKILL_STEPS=200, RECENT=10_000, MODEL_BATCH=256,
-                     TEMPERATURE=0.01, MINUTES=45.0),  # the published 0.1 at our reward scale
+    "ant_dads": dict(METHOD="dads", AXES=2, Z_RANGE=1.0, PROFILE=40, SKILL_STEPS=200, RECENT=10_000, MODEL_BATCH=256, MINUTES=45.0),
     "ant_sectar": (SECTAR := dict(METHOD="sectar", EGOCENTRIC=False, AXES=8, LENGTH=50, HOLD=1, PROFILE=10, SKILL_STEPS=50, RECENT=128_000,
                                   MODEL_BATCH=64, TEMPERATURE=0.003, MINUTES=45.0)),
     "ant_sectar_no_explorer": SECTAR | dict(EXPLORE=0.0),  # what the explorer is good for
@@ -204,7 +203,7 @@ class Dads:
         return math.log(PRIOR_SAMPLES + 1) - (1 + (others - own[:, None]).clamp(-50, 50).exp().sum(1)).log()
 
     def reward(self, displacement, t, z, floor):
-        return REWARD_SCALE * self.information(displacement[:, 0], z), None
+        return REWARD_SCALE * self.information(displacement[:, 0], z), z
 
     def loss(self, s, a, displacement, z, actor):
         """-log q of recent steps under the skills that made them (never under relabelled ones: q would learn that z means nothing)."""
@@ -367,13 +366,17 @@ def by_speed(values):
     return [float(part.mean()) for part in np.split(values, [n, len(values) - n])]
 
 
-def paths(actor, z, steps, hold, weight, deterministic=True):
-    """Executed positions (n, steps * hold + 1, 2 or 1) in metres of skills z (n, M) from rest, mean actions unless told."""
+def paths(actor, z, steps, hold, weight, deterministic=True, starts=0):
+    """Executed positions (n, steps * hold + 1, 2 or 1) in metres of skills z (n, M) from rest, mean actions unless told. starts: the mean
+    over so many noisy starts instead."""
+    n, z = len(z), z.repeat(max(1, starts), 1)
     robots = make_robots(len(z))
+    if starts:
+        robots.reset(np.arange(len(z)), np.random.default_rng(SEED + 2))
     track = [robots.qpos[:, :robots.place].copy()]
     for _ in execute(actor, robots, z, steps, hold, weight, deterministic):
         track.append(robots.qpos[:, :robots.place].copy())
-    return np.stack(track, 1)
+    return np.stack(track, 1).reshape(-1, n, len(track), robots.place).mean(0)
 
 
 def traversal(axis, values):
@@ -550,7 +553,7 @@ def train(method, config):
     torch.manual_seed(SEED)
     robots = make_robots(ROBOTS)
     s_dim, a_dim, z_dim, span = robots.observe().shape[1], robots.ctrl.shape[1], method.z_dim, method.span
-    actor = Actor(s_dim - EGOCENTRIC, z_dim, a_dim, HIDDEN, method.decoder if EGOCENTRIC else None)
+    actor = Actor(s_dim - EGOCENTRIC, z_dim, a_dim, HIDDEN, method.decoder if EGOCENTRIC and METHOD == "wedis" else None, EGOCENTRIC)
     n_in = actor.net[0].in_features
     critics, value, target = Critics(n_in + a_dim), value_network(n_in), value_network(n_in).requires_grad_(False)
     target.load_state_dict(value.state_dict())
@@ -637,7 +640,7 @@ def train(method, config):
         if not updates:  # state statistics of the random steps, kept from here on
             first = replay[:env_steps, :s_dim]
             if EGOCENTRIC:
-                first, *_ = egocentric(first, next(first_step(method.decoder, replay[:env_steps, -z_dim:])))
+                first, *_ = egocentric(first, actor.wanted(replay[:env_steps, -z_dim:]))
             actor.s_mean.copy_(first.mean(0)), actor.s_std.copy_(first.std(0).clamp(min=1e-3))
             average.load_state_dict(actor.state_dict())
 
@@ -749,7 +752,7 @@ if __name__ == "__main__":
     torch.manual_seed(SEED)
     error_sampled, *_ = tracking(*grid_run(actor, decoder, deterministic=False)[:2])
     accelerating = "acceleration" in names
-    profiles = [np.diff(paths(actor, traversal(i, values), 5, PROFILE, weight)[:, ::PROFILE], axis=1) / (PROFILE * STEP_SCALE)
+    profiles = [np.diff(paths(actor, traversal(i, values), 5, PROFILE, weight, starts=STARTS)[:, ::PROFILE], axis=1) / (PROFILE * STEP_SCALE)
                 for i in range(AXES)]
     C, purity = cross_talk([factors_of(profile, accelerating) for profile in profiles], names, ranges)
     if METHOD == "wedis":

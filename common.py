@@ -519,11 +519,13 @@ def egocentric(s, step):
 
 class Actor(nn.Module):
     """pi_psi(a | s, z_single): a Gaussian squashed by tanh, Sec. 4.2.2. Normalises the state by fixed statistics. With a decoder it is
-    egocentric: it sees the step the decoder predicts for z instead of z, from the torso's heading."""
+    egocentric: it sees the step the decoder predicts for z instead of z, from the torso's heading. Egocentric without a decoder (DADS), it
+    takes z itself for a step and sees that turned."""
 
-    def __init__(self, s_dim, z_dim, a_dim, hidden, decoder=None):
+    def __init__(self, s_dim, z_dim, a_dim, hidden, decoder=None, turned=False):
         super().__init__()
         self.decoder = decoder
+        self.register_buffer("turned", torch.tensor(turned or decoder is not None))
         self.net = nn.Sequential(nn.Linear(s_dim + z_dim, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
                                  nn.Linear(hidden, 2 * a_dim))
         self.register_buffer("s_mean", torch.zeros(s_dim))
@@ -534,10 +536,12 @@ class Actor(nn.Module):
         """s (B, n), z (B, m), step: the decoder's mean for z if it is known -> what the networks see (B, s_dim + z_dim) and by how
         many quarter turns the legs are counted on (B,)."""
         turns = torch.zeros(len(s), dtype=torch.int64)
-        if self.decoder is not None:
-            step = next(first_step(self.decoder, z)) if step is None else step
-            s, z, turns = egocentric(s, step)
+        if self.turned:
+            s, z, turns = egocentric(s, self.wanted(z) if step is None else step)
         return torch.cat([((s - self.s_mean) / self.s_std).clamp(-10, 10), z], -1), turns
+
+    def wanted(self, z):
+        return z if self.decoder is None else next(first_step(self.decoder, z))
 
     def forward(self, x, deterministic=False):
         """x of inputs -> action (B, a_dim) in (-1, 1), log-probability (B,)."""
@@ -563,14 +567,14 @@ class Actor(nn.Module):
 
     def seen(self, action, turns):
         """Actions with legs counted on by quarter turns: of the motors -> of the networks; with -turns back again."""
-        return action if self.decoder is None else turn_legs(action, turns, ANKLES.roll(1))  # motors begin with leg 4
+        return action if not self.turned else turn_legs(action, turns, ANKLES.roll(1))  # motors begin with leg 4
 
 
 def load_actor(content):
     state = content["actor"]
     a_dim, hidden, s_dim = len(state["net.4.bias"]) // 2, len(state["net.0.bias"]), len(state["s_mean"])
     decoder = load_decoder(content) if "decoder.axes" in state else None
-    actor = Actor(s_dim, state["net.0.weight"].shape[1] - s_dim, a_dim, hidden, decoder)
+    actor = Actor(s_dim, state["net.0.weight"].shape[1] - s_dim, a_dim, hidden, decoder, bool(state["turned"]))
     actor.told = state["told"].clone()  # its length is free
     actor.load_state_dict(state)
     return actor.requires_grad_(False)

@@ -1,4 +1,5 @@
 """Stage 3: DADS and SeCTAR against torch.distributions and plain loops, and through the command line into stage 4."""
+import math
 import signal
 
 import common
@@ -7,8 +8,8 @@ import pytest
 import torch
 from torch import distributions as D
 
-TINY = ["--minutes", 0, "--updates", 32, "--reports", 2, "--robots", 8, "--warm_up", 400, "--replay", 800, "--hidden", 32, "--coverage", 3, "--traversal", 3,
-        "--checkpoint", 0, "--threads", 1]
+TINY = ["--minutes", 0, "--updates", 32, "--reports", 2, "--robots", 8, "--warm_up", 400, "--replay", 800, "--hidden", 32, "--coverage", 3,
+        "--traversal", 3, "--starts", 1, "--checkpoint", 0, "--threads", 1]
 BASELINES = {"ant_dads": "dads", "ant_sectar": "sectar"}
 
 
@@ -243,3 +244,18 @@ def test_settings_that_do_not_fit_trajectories_are_refused_with_one_line(fork, t
     assert done.returncode == 2 and "--warm_up must be at least 3200" in done.stderr and done.stderr.count("\n") == 1
     done = fork("03_train_policy", "--out", tmp_path, "--method", "ppo")
     assert done.returncode == 2 and "unknown method 'ppo'; allowed: wedis dads sectar" in done.stderr
+
+
+def test_dads_takes_z_for_a_step_and_turns_it_with_the_ant():
+    """The same Ant in a world turned by an angle, z turned with it: the same action of its motors."""
+    torch.manual_seed(0)
+    actor, t = common.Actor(26, 2, 8, 16, None, True), 0.4
+    s, z = torch.randn(6, 27), torch.randn(6, 2)
+    s[:, 1:5] /= s[:, 1:5].norm(dim=1, keepdim=True)
+    turn = torch.tensor([[math.cos(t), math.sin(t)], [-math.sin(t), math.cos(t)]])  # rows are turned from the right
+    half = torch.tensor([[math.cos(t / 2), math.sin(t / 2)], [-math.sin(t / 2), math.cos(t / 2)]])
+    there = s.clone()
+    there[:, [1, 4]], there[:, [2, 3]] = s[:, [1, 4]] @ half, s[:, [2, 3]] @ half  # of (cos t/2, 0, 0, sin t/2) times the quaternion
+    there[:, 13:15] = s[:, 13:15] @ turn
+    torch.testing.assert_close(actor.act(there, z @ turn, True), actor.act(s, z, True), atol=1e-5, rtol=0)
+    assert (actor.act(there, z, True) - actor.act(s, z, True)).abs().max() > 1e-3

@@ -273,7 +273,7 @@ def test_three_stages_from_the_command_line(fork, tmp_path):
     assert done.returncode == 0 and done.stdout.count("purity") == 2 * 4, done.stdout + done.stderr  # two headings, two times three axes
     assert len(common.read_csv(tmp_path / "results/wetvae.csv")) == 6 and len(common.read_csv(tmp_path / "results/crosstalk.csv")) == 18
     done = fork("03_train_policy", "--out", tmp_path, "--updates", 80, "--reports", 2, "--warm_up", 1000, "--replay", 5000,
-               "--hidden", 32, "--coverage", 5, "--traversal", 3, "--calibrated", 1)
+               "--hidden", 32, "--coverage", 5, "--traversal", 3, "--starts", 1, "--calibrated", 1)
     assert done.returncode == 0 and "calibrated: z_direction " in done.stdout and f"using {tmp_path}" in done.stdout, done.stderr
     row, = common.read_csv(tmp_path / "results/policies.csv")
     assert row["experiment"] == "ant_semi" and int(row["updates"]) == 80 and float(row["tracking_error"]) > 0
@@ -291,7 +291,7 @@ def test_half_cheetah_and_full_circle_from_the_command_line(fork, tmp_path):
                     "--baseline_epochs", 1)
         assert done.returncode == 0, done.stderr
         done = fork("03_train_policy", "--out", tmp_path, "--experiment", experiment, "--updates", 8, "--reports", 1, "--warm_up", 640,
-                   "--replay", 2000, "--hidden", 32, "--coverage", 5, "--traversal", 3, "--calibrated", 1)
+                   "--replay", 2000, "--hidden", 32, "--coverage", 5, "--traversal", 3, "--starts", 1, "--calibrated", 1)
         assert done.returncode == 0 and "tracking error" in done.stdout, done.stderr
     rows = common.read_csv(tmp_path / "results/policies.csv")
     assert {r["experiment"]: r["robot"] for r in rows} == dict(half_cheetah="half_cheetah", ant_full="ant")
