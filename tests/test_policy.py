@@ -212,6 +212,24 @@ def test_relation_of_the_half_cheetah_is_recovered_likewise(s3, monkeypatch):
     assert abs(weight - 0.12) < 0.01  # not exact: where braking turns the direction round, sign(z) flips and the free run does not
 
 
+def test_a_policy_that_is_taken_over_walks_the_steps_of_the_other_decoder(s3, monkeypatch, tmp_path):
+    """Told z of the full circle it does what it does when given that decoder's step; and one that is not egocentric is refused."""
+    torch.manual_seed(0)
+    monkeypatch.setattr(s3, "TAKEN", "ant_semi")
+    decoder = common.load_decoder(common.load(tmp_path, "wetvae", "full_circle", 0))
+    taken, own = common.load_actor(s3.take(decoder)), common.load_actor(common.load(tmp_path, "policy", "ant_semi", 0))
+    robots, z = common.Robots(common.ant_spec(), 20), torch.randn(20, 2)
+    robots.reset(np.arange(20), np.random.default_rng(0))
+    s = robots.observe()
+    x, turns = own.inputs(s, z, common.predict(decoder, nn.functional.pad(z, (0, 1)), 1)[:, 0])
+    torch.testing.assert_close(taken.act(s, z, True), own.seen(own(x, True)[0], -turns))
+    content = common.load(tmp_path, "policy", "ant_semi", 0)
+    del content["actor"]["decoder.axes"]
+    monkeypatch.setattr(s3, "load", lambda *_: content)
+    with pytest.raises(SystemExit):
+        s3.take(decoder)
+
+
 def test_what_to_tell_inverts_what_is_achieved(s3):
     """A policy that achieves 0.8 v - 0.1 must be told (v + 0.1) / 0.8; noise that falls is evened out, ends are held."""
     z = np.linspace(-2, 2, 33)
@@ -290,7 +308,7 @@ def test_half_cheetah_and_full_circle_from_the_command_line(fork, tmp_path):
         done = fork("02_train_wetvae", "--out", tmp_path, "--experiment", decoder, "--batch", 500, "--held_out", 500, "--epochs", 1,
                     "--baseline_epochs", 1)
         assert done.returncode == 0, done.stderr
-        done = fork("03_train_policy", "--out", tmp_path, "--experiment", experiment, "--updates", 8, "--reports", 1, "--warm_up", 640,
+        done = fork("03_train_policy", "--out", tmp_path, "--experiment", experiment, "--taken", "", "--updates", 8, "--reports", 1, "--warm_up", 640,
                    "--replay", 2000, "--hidden", 32, "--coverage", 5, "--traversal", 3, "--starts", 1, "--calibrated", 1)
         assert done.returncode == 0 and "tracking error" in done.stdout, done.stderr
     rows = common.read_csv(tmp_path / "results/policies.csv")
