@@ -369,11 +369,13 @@ def by_speed(values):
 
 def paths(actor, z, steps, hold, weight, deterministic=True, starts=0):
     """Executed positions (n, steps * hold + 1, 2 or 1) in metres of skills z (n, M) from rest, mean actions unless told. starts: the mean
-    over so many noisy starts instead."""
+    over so many noisy starts instead, after a run-in of `hold` steps (from rest the first step is short and looks like acceleration)."""
     n, z = len(z), z.repeat(max(1, starts), 1)
     robots = make_robots(len(z))
     if starts:
         robots.reset(np.arange(len(z)), np.random.default_rng(SEED + 2))
+        for _ in execute(actor, robots, z, 1, hold, weight, deterministic):
+            pass
     track = [robots.qpos[:, :robots.place].copy()]
     for _ in execute(actor, robots, z, steps, hold, weight, deterministic):
         track.append(robots.qpos[:, :robots.place].copy())
@@ -463,7 +465,7 @@ def draw_skills(actor, decoder, weight, name, columns):
                 ax.set_aspect("equal")
         axes[0, column].set(title=f"{title}, $H_z$ = {hold}, T = {steps}")
         axes[1, column].set(xlabel="x (m)")
-    for row, text in enumerate(("predicted by the decoder", "executed by the robot")):
+    for row, text in enumerate(("predicted by the model", "executed by the robot")):
         axes[row, 0].set_ylabel(text + "\n" + (axes[row, 0].get_ylabel() or "y (m)"))
     last = axes[0, -1].get_legend_handles_labels()
     figure.legend(*last, title="latent" if both.shape[2] == 2 else "time step", loc="outside right upper")
