@@ -170,7 +170,8 @@ RUBBISH = [  # script, flags, exit code, the line without the script's name; OUT
     (S2, "--labels colour", 2, "no weak label 'colour'; allowed: speed direction curvature angle x y velocity acceleration"),
     (S2, "", 2, "no dataset_main_seed0.npz in runs/ or pretrained/; make it with: python 01_make_dataset.py --experiment main --seed 0"),
     (S2, "--data_seed 7", 2, "no dataset_main_seed7.npz in runs/ or pretrained/; make it with: python 01_make_dataset.py --experiment main --seed 7"),
-    (S3, "--experiment ant_demi", 2, "unknown experiment 'ant_demi'; allowed: ant_semi ant_full half_cheetah"),
+    (S3, "--experiment ant_demi", 2, "unknown experiment 'ant_demi'; allowed: ant_semi ant_full half_cheetah ant_dads ant_sectar "
+     "ant_sectar_no_explorer"),
     (S3, "--decoder nope", 2, "no wetvae_nope_seed0.pt in runs/ or pretrained/; make it with: python 02_train_wetvae.py --experiment nope --seed 0"),
     (S3, "--train false --seed 98", 2,
      "no policy_ant_semi_seed98.pt in runs/ or pretrained/; make it with: python 03_train_policy.py --experiment ant_semi --seed 98"),
