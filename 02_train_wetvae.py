@@ -38,11 +38,11 @@ BETA = 9.0             # weight of the KL divergence, Eq. 4
 BASELINE_BETA = 1.0    # of the trajectory VAE: at 9 its latent collapses (KL 0.000), which would make a straw man of it
 BETA_WARM_UP = 0.5     # share of the updates over which beta grows from 0: at once, hard data sets lose an axis for good
 OWN_AXIS = True        # p(y^m | z^m): label m is read from latent m alone, its classes in order on it (false: from all of z, as Eq. 4 is printed)
-BASELINE_EPOCHS = 24   # of the trajectory VAE
 GAMMA = 10.0           # weight of the label cross-entropies, Eq. 4
 HIDDEN = 64            # width of every unit in Fig 1
 BATCH = 512            # trajectories per update (the paper: 2048)
 EPOCHS = 12            # the paper: 300
+BASELINE_EPOCHS = 24   # of the trajectory VAE
 LEARNING_RATE = 2e-3   # Adam, decays linearly to 0 (the paper: 2e-4, fixed)
 HELD_OUT = 5000        # trajectories kept for |corr|, MIG and SAP
 THREADS = 2            # CPU threads
@@ -65,7 +65,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
     "cartesian": dict(DATA="polar", LABELS="x y", FACTORS="x y", FIGURE="fig11_polar_cartesian", COLUMNS=[
         ("polar labels", "polar", 5), ("Cartesian labels", "cartesian", 5), ("no labels", "polar_none", 5)]),
     "speed_acc": dict(EPOCHS=24, BETA=4.0, DATA="speed_acc", LABELS="velocity acceleration", BASE="-1 0", MODELS={"": {}, "none": NONE},
-                               FIGURE="fig12_speed_acceleration", COLUMNS=[("WET-VAE", "speed_acc", 5), ("no labels", "speed_acc_none", 5)]),
+                      FIGURE="fig12_speed_acceleration", COLUMNS=[("WET-VAE", "speed_acc", 5), ("no labels", "speed_acc_none", 5)]),
     "four_factors": dict(
         EPOCHS=36, BETA=5.0, DATA="four_factors", LABELS="speed angle curvature acceleration", MODELS={"": {}, "circle": dict(CIRCLE=True)},
         FIGURE="fig13_four_factors", COLUMNS=[("Gaussian axis", "four_factors", 5), ("circle", "four_factors_circle", 5)]),

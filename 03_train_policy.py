@@ -69,12 +69,14 @@ FLOOR_END = 0.01         # shrinks to this between 0.15 and 0.6 of the updates: 
 RECENT = 0               # latest steps that a baseline's model learns from, once in UPDATES_PER_STEP updates
 MODEL_BATCH = 0          # steps (DADS) or trajectories (SeCTAR) in a batch of theirs
 PRIOR_SAMPLES = 100      # L of DADS's reward
+MOMENTS = 0.02           # rate of the running mean and deviation that normalise DADS's targets
 EXPLORE = 0.3            # SeCTAR: share of trajectories that are the explorer's (0: no explorer)
 KL_WEIGHT = 2.0          # SeCTAR
 CLONING = 100.0          # SeCTAR: weight of behaviour cloning
 VAE_SCALE = 0.01         # of SeCTAR's loss beside SAC's; Adam does not notice, but for the actor: cloning against reward
 
-CALIBRATED = 16          # starts at each of 33 speeds from which told speeds are calibrated; 0: not (the paper)
+CALIBRATED = 16          # starts at each speed from which told speeds are calibrated; 0: not (the paper)
+SPEEDS = 33              # speeds of that calibration, z_speed from -2 to 2
 TRAVERSAL = 13           # skills on each axis at which executed purity and the relation function are measured
 STARTS = 16              # noisy starts over which an executed skill is averaged for its purity
 COVERAGE = 200           # random skills whose visited cells of 1 m are counted at the end
@@ -85,9 +87,9 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
     "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, EGOCENTRIC=False, AXES=2,                 # Fig 16
                          UPDATES=100_000, CALIBRATED=0),  # it does not fall short once it runs
     # the baselines train by the clock, as long as WEDIS takes
-    "ant_dads": dict(METHOD="dads", AXES=2, Z_RANGE=1.0, PROFILE=40, SKILL_STEPS=200, RECENT=10_000, MODEL_BATCH=256, MINUTES=45.0),
+    "ant_dads": dict(METHOD="dads", AXES=2, Z_RANGE=1.0, SKILL_STEPS=200, RECENT=10_000, MODEL_BATCH=256, MINUTES=45.0),
     "ant_sectar": (SECTAR := dict(METHOD="sectar", EGOCENTRIC=False, AXES=8, LENGTH=50, HOLD=1, PROFILE=10, SKILL_STEPS=50, RECENT=128_000,
-                                  MODEL_BATCH=64, TEMPERATURE=0.003, MINUTES=45.0)),
+                                  MODEL_BATCH=64, MINUTES=45.0)),
     "ant_sectar_no_explorer": SECTAR | dict(EXPLORE=0.0),  # what the explorer is good for
 }
 FACTORS = dict(speed=1.0, direction=2 * math.pi, curvature=math.pi / 3)  # of which the baselines' axes know nothing: full ranges, Table 1
@@ -209,7 +211,7 @@ class Dads:
     def loss(self, s, a, displacement, z, actor):
         """-log q of recent steps under the skills that made them (never under relabelled ones: q would learn that z means nothing)."""
         x = displacement[:, 0] / STEP_SCALE
-        self.decoder.x_mean.lerp_(x.mean(0), 0.02), self.decoder.x_std.lerp_(x.std(0), 0.02)  # q's unit deviation is in these units
+        self.decoder.x_mean.lerp_(x.mean(0), MOMENTS), self.decoder.x_std.lerp_(x.std(0), MOMENTS)  # q's unit deviation is in these units
         return -self.decoder.log_prob((x - self.decoder.x_mean) / self.decoder.x_std, *self.decoder.mixture(z[:, 0])).mean()
 
     def measure(self, displacement, z):
@@ -421,9 +423,9 @@ def to_tell(asked, achieved, z):
 
 
 def calibrate_speeds(actor, decoder):
-    """Beyond the paper: the policy's achieved speeds, in the second half of episodes from noisy starts and in all directions, inverted. (2, 33)
-    for actor.told: every skill is then told a little faster than it is asked, by as much as the policy falls short once it walks."""
-    z = torch.linspace(-2, 2, 33)
+    """Beyond the paper: the policy's achieved speeds, in the second half of episodes from noisy starts and in all directions, inverted: (2,
+    SPEEDS) for actor.told: every skill is then told a little faster than it is asked, by as much as the policy falls short once it walks."""
+    z = torch.linspace(-2, 2, SPEEDS)
     skills = nn.functional.pad(torch.cartesian_prod(z, 3 * torch.rand(CALIBRATED) - 1.5), (0, 1)) if ROBOT == "ant" else (
         nn.functional.pad(z.repeat_interleave(CALIBRATED)[:, None], (0, 1)))
     robots = make_robots(len(skills))
@@ -434,7 +436,7 @@ def calibrate_speeds(actor, decoder):
     walked = (places[-1] - places[EPISODE // 2 - 1]) / (EPISODE // 2 * STEP_SCALE)
     if ROBOT == "ant":  # along the step; on a rail the sign counts
         walked, step = (walked * step).sum(1, keepdims=True) / np.linalg.norm(step, axis=1, keepdims=True), np.linalg.norm(step, axis=1)
-    asked, achieved = (v.reshape(33, CALIBRATED).mean(1) for v in (step, walked))
+    asked, achieved = (v.reshape(len(z), CALIBRATED).mean(1) for v in (step, walked))
     return torch.stack([z, torch.from_numpy(to_tell(asked, achieved, z.numpy())).float()])
 
 
@@ -560,7 +562,7 @@ def train(method, config):
     n_in = actor.net[0].in_features
     critics, value, target = Critics(n_in + a_dim), value_network(n_in), value_network(n_in).requires_grad_(False)
     target.load_state_dict(value.state_dict())
-    average = copy.deepcopy(actor).requires_grad_(False)  # of the late weights: single ones swing, and one robot in ten stands still
+    average = copy.deepcopy(actor).requires_grad_(False)  # of the late weights: single ones swing from report to report
     networks = nn.ModuleList([actor, critics, value, method.model])
     optimizer = torch.optim.Adam(networks.parameters(), lr=LEARNING_RATE, fused=True)
 
