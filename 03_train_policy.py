@@ -14,7 +14,7 @@ from itertools import combinations, permutations
 from pathlib import Path
 
 import common  # before mujoco: it chooses how mujoco renders
-from common import (Actor, Decoder, Robots, SkillDynamics, ant_spec, artifact_name, check_same, cross_talk, egocentric, execute,
+from common import (EXPLORER, Actor, Decoder, Robots, SkillDynamics, ant_spec, artifact_name, check_same, cross_talk, egocentric, execute,
                     factors_of, first_step, load, load_actor, load_decoder, parse_flags, plt, predict, resumable, save, save_figure, stop, update_csv)
 import mujoco
 import numpy as np
@@ -56,7 +56,8 @@ RELABELLED = 0.5         # share of a batch given a fresh skill from the prior (
 
 EGOCENTRIC = True        # the networks see state and wanted step from the torso, up to quarter turns (false: s and z, the paper)
 HIDDEN = 256             # width of the two hidden layers (the paper: 512)
-LEARNING_RATE = 1e-3     # Adam, decays linearly to 0 over the second half (the paper: 3e-4, fixed)
+LEARNING_RATE = 1e-3     # Adam (the paper: 3e-4, fixed)
+DECAY_FROM = 0.5         # share of the updates after which the learning rate falls linearly to 0
 AVERAGED = 0.002         # rate of the average over the actor's weights that is measured and kept; 1: the actor itself
 DISCOUNT = 0.97          # gamma of Eq. 1 (the paper: 0.99)
 SMOOTHING = 0.01         # of the target value network, App. A.1.3
@@ -72,8 +73,10 @@ PRIOR_SAMPLES = 100      # L of DADS's reward
 MOMENTS = 0.02           # rate of the running mean and deviation that normalise DADS's targets
 EXPLORE = 0.3            # SeCTAR: share of trajectories that are the explorer's (0: no explorer)
 KL_WEIGHT = 2.0          # SeCTAR
-CLONING = 100.0          # SeCTAR: weight of behaviour cloning
+CLONING = 1.0            # SeCTAR: weight of behaviour cloning (published: 100; the actor then imitates its own standing still)
 VAE_SCALE = 0.01         # of SeCTAR's loss beside SAC's; Adam does not notice, but for the actor: cloning against reward
+SURPRISE_SCALE = 0.02    # SeCTAR: the explorer's reward, of at most SURPRISE nats a step; it shares critics with the skills
+SURPRISE = 10.0
 
 CALIBRATED = 16          # starts at each speed from which told speeds are calibrated; 0: not (the paper)
 SPEEDS = 33              # speeds of that calibration, z_speed from -2 to 2
@@ -88,12 +91,11 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
                          UPDATES=100_000, CALIBRATED=0),  # it does not fall short once it runs
     # the baselines train by the clock, as long as WEDIS takes
     "ant_dads": dict(METHOD="dads", AXES=2, Z_RANGE=1.0, SKILL_STEPS=200, RECENT=10_000, MODEL_BATCH=256, MINUTES=45.0),
-    "ant_sectar": (SECTAR := dict(METHOD="sectar", EGOCENTRIC=False, AXES=8, LENGTH=50, HOLD=1, PROFILE=10, SKILL_STEPS=50, RECENT=128_000,
+    "ant_sectar": (SECTAR := dict(METHOD="sectar", AXES=8, LENGTH=50, HOLD=1, PROFILE=10, SKILL_STEPS=50, RECENT=128_000,
                                   MODEL_BATCH=64, MINUTES=45.0)),
     "ant_sectar_no_explorer": SECTAR | dict(EXPLORE=0.0),  # what the explorer is good for
 }
 FACTORS = dict(speed=1.0, direction=2 * math.pi, curvature=math.pi / 3)  # of which the baselines' axes know nothing: full ranges, Table 1
-EXPLORER = 3.0           # every entry of the z that means "explore" to SeCTAR's policy: far from N(0, I), and no plan asks for it
 
 
 def half_cheetah_spec():
@@ -178,7 +180,7 @@ class Wedis:
 
     def reward(self, displacement, t, z, floor):
         step, log_var = first_step(self.decoder, z)
-        return reward(step, log_var, displacement[:, 0], floor), step
+        return reward(step, log_var, displacement[:, 0], floor), step, step
 
     def loss(self, s, a, displacement, z, actor):
         return torch.zeros(())
@@ -206,7 +208,7 @@ class Dads:
         return math.log(PRIOR_SAMPLES + 1) - (1 + (others - own[:, None]).clamp(-50, 50).exp().sum(1)).log()
 
     def reward(self, displacement, t, z, floor):
-        return REWARD_SCALE * self.information(displacement[:, 0], z), z
+        return REWARD_SCALE * self.information(displacement[:, 0], z), z, z
 
     def loss(self, s, a, displacement, z, actor):
         """-log q of recent steps under the skills that made them (never under relabelled ones: q would learn that z means nothing)."""
@@ -240,7 +242,11 @@ class Sectar:
         self.model = nn.ModuleDict(dict(decoder=self.decoder, encoder=self.encoder))
 
     def sample(self, n):
-        return torch.where(torch.rand(n, 1) < EXPLORE, EXPLORER, torch.randn(n, self.z_dim))
+        return torch.where(torch.rand(n, 1) < EXPLORE, self.explorers(n), torch.randn(n, self.z_dim))
+
+    def explorers(self, n):
+        """What tells the policy to explore, (n, AXES): a step that is far too long, anywhere, and a mark."""
+        return nn.functional.pad(EXPLORER * nn.functional.normalize(torch.randn(n, 2)), (0, self.z_dim - 2), value=EXPLORER)
 
     def posterior(self, x):
         """Displacements x (B, T, 2) in trajectory units -> a sample of q(z | tau) (B, AXES), its KL divergence from the prior (B,)."""
@@ -253,31 +259,35 @@ class Sectar:
         return mean, log_var.clamp(min=2 * math.log(floor / STEP_SCALE))
 
     def reward(self, displacement, t, z, floor):
-        """displacement (K, T, 2) of whole trajectories, t (n, K): the steps of each that are asked for, z (K, AXES) -> (n K,)."""
-        x, explorer, i, kl = displacement / STEP_SCALE, z[:, 0] == EXPLORER, torch.arange(len(z)), torch.zeros(len(z))
+        """displacement (K, T, 2) of whole trajectories, t (n, K): the steps of each that are asked for, z (K, AXES) -> (n K,), and
+        what the policy is told at t and after it (n K, 2)."""
+        x, explorer, i, kl = displacement / STEP_SCALE, z[:, -1] == EXPLORER, torch.arange(len(z)), torch.zeros(len(z))
+        told = z
         if explorer.any():
             z = z.clone()
             z[explorer], kl[explorer] = self.posterior(x[explorer])
         mean, log_var = self.decode(z, FLOOR_END)
+        steps = torch.where(explorer[:, None, None], told[:, None, :2], mean)
         x, mean, log_var = x[i, t], mean[i, t], log_var[i, t]
         surprise = 0.5 * (log_var + math.log(2 * math.pi) + (x - mean) ** 2 / log_var.exp()).sum(2) + KL_WEIGHT * kl / SKILL_STEPS
         # of a skill less its value at the mean, as WEDIS's: what depends on z and t alone does not change what is best
         follow = -0.5 * ((x - mean) ** 2 / log_var.exp().clamp(min=(floor / STEP_SCALE) ** 2)).sum(2)
-        return REWARD_SCALE * torch.where(explorer, surprise.clamp(max=20), follow).flatten(), None
+        r = torch.where(explorer, SURPRISE_SCALE * surprise.clamp(max=SURPRISE), REWARD_SCALE * follow)
+        return r.flatten(), *(steps[i, u].flatten(0, 1) for u in (t, (t + 1).clamp(max=SKILL_STEPS - 1)))
 
     def elbo(self, x):
-        """Displacements (B, T, 2) in trajectory units -> sum_t log p(x_t | z), KL(q || p), both (B,), and z (B, AXES) ~ q."""
+        """Displacements (B, T, 2) in trajectory units -> sum_t log p(x_t | z), KL(q || p), both (B,), and the decoded means (B, T, 2)."""
         z, kl = self.posterior(x)
         mean, log_var = self.decode(z, FLOOR_END)
-        return -0.5 * (log_var + math.log(2 * math.pi) + (x - mean) ** 2 / log_var.exp()).sum((1, 2)), kl, z
+        return -0.5 * (log_var + math.log(2 * math.pi) + (x - mean) ** 2 / log_var.exp()).sum((1, 2)), kl, mean
 
     def loss(self, s, a, displacement, z, actor):
         """Negative ELBO of recent trajectories and cloning of eight actions of each, by the policy told q's z. It reaches the encoder too."""
-        log_p, kl, z = self.elbo(displacement / STEP_SCALE)
-        i, t = torch.arange(len(z))[:, None], torch.randint(SKILL_STEPS, (len(z), 8))
-        x, _ = actor.inputs(s[i, t].flatten(0, 1), z.repeat_interleave(8, 0))
+        log_p, kl, steps = self.elbo(displacement / STEP_SCALE)
+        i, t = torch.arange(len(s))[:, None], torch.randint(SKILL_STEPS, (len(s), 8))
+        x, turns = actor.inputs(s[i, t].flatten(0, 1), None, steps[i, t].flatten(0, 1))
         action, _ = actor(x, deterministic=True)
-        miss = 0.5 * ((action - a[i, t].flatten(0, 1)) ** 2).sum(1)
+        miss = 0.5 * ((action - actor.seen(a[i, t].flatten(0, 1), turns)) ** 2).sum(1)
         return VAE_SCALE * ((KL_WEIGHT * kl - log_p).mean() + CLONING * miss.mean())
 
     def reconstruction_error(self, x):
@@ -466,6 +476,8 @@ def draw_skills(actor, decoder, weight, name, columns):
                 ax.set(xlim=(low[0], high[0]), ylim=(min(-3, low[1]), max(3, high[1])))
                 ax.set_aspect("equal")
         axes[0, column].set(title=f"{title}, $H_z$ = {hold}, T = {steps}")
+        if len(values) != len(columns[-1][2]):  # not the latents that the legend of the figure names
+            axes[0, column].legend(title="latent", fontsize=7, loc="upper left")
         axes[1, column].set(xlabel="x (m)")
     for row, text in enumerate(("predicted by the model", "executed by the robot")):
         axes[row, 0].set_ylabel(text + "\n" + (axes[row, 0].get_ylabel() or "y (m)"))
@@ -519,7 +531,7 @@ def measure_baseline(actor, policy, method, skills):
         miss = predict(method.decoder, skills, SKILL_STEPS).cumsum(1) - executed.cumsum(1)
         found["self_consistency_error" + name] = (miss.square().mean() / executed.cumsum(1).square().mean()).sqrt().item()
     if EXPLORE:
-        track = paths(actor, torch.full_like(skills, EXPLORER), EPISODE, 1, None, False)
+        track = paths(actor, method.explorers(len(skills)), EPISODE, 1, None, False)
         found["explorer_coverage_cells"] = cells(track)
     return found
 
@@ -558,11 +570,13 @@ def train(method, config):
     torch.manual_seed(SEED)
     robots = make_robots(ROBOTS)
     s_dim, a_dim, z_dim, span = robots.observe().shape[1], robots.ctrl.shape[1], method.z_dim, method.span
-    actor = Actor(s_dim - EGOCENTRIC, z_dim, a_dim, HIDDEN, method.decoder if EGOCENTRIC and METHOD == "wedis" else None, EGOCENTRIC)
+    told = method.decoder if EGOCENTRIC and METHOD != "dads" else None
+    actor = Actor(s_dim - EGOCENTRIC, robots.place if told else z_dim, a_dim, HIDDEN, told, EGOCENTRIC)
     n_in = actor.net[0].in_features
     critics, value, target = Critics(n_in + a_dim), value_network(n_in), value_network(n_in).requires_grad_(False)
     target.load_state_dict(value.state_dict())
     average = copy.deepcopy(actor).requires_grad_(False)  # of the late weights: single ones swing from report to report
+    average.decoder = actor.decoder  # SeCTAR's learns
     networks = nn.ModuleList([actor, critics, value, method.model])
     optimizer = torch.optim.Adam(networks.parameters(), lr=LEARNING_RATE, fused=True)
 
@@ -628,7 +642,7 @@ def train(method, config):
             a = torch.rand(ROBOTS, a_dim) * 2 - 1
         else:
             with torch.no_grad():
-                a = actor.act(s, z)
+                a = actor.act(s, z, t=int(age[0]) % span)
         displacement, failed = robots.step(a.numpy())
         rows = torch.arange(env_steps, env_steps + ROBOTS) % len(replay)
         replay[rows] = torch.cat([s, a, robots.observe(), displacement, z], 1)
@@ -645,14 +659,15 @@ def train(method, config):
         if not updates:  # state statistics of the random steps, kept from here on
             first = replay[:env_steps, :s_dim]
             if EGOCENTRIC:
-                first, *_ = egocentric(first, actor.wanted(replay[:env_steps, -z_dim:]))
+                with torch.no_grad():
+                    first, *_ = egocentric(first, actor.wanted(replay[:env_steps, -z_dim:]))
             actor.s_mean.copy_(first.mean(0)), actor.s_std.copy_(first.std(0).clamp(min=1e-3))
             average.load_state_dict(actor.state_dict())
 
         # Improve: a few updates. What needs no gradient is computed for all of them at once
         floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** min(1, max(0, (progress - 0.15) / 0.45))
         for group in optimizer.param_groups:
-            group["lr"] = LEARNING_RATE * min(1, max(0, 2 * (1 - progress)))
+            group["lr"] = LEARNING_RATE * min(1, max(0, (1 - progress) / (1 - DECAY_FROM)))
         s, a, _, displacement, skill = replay[trajectories(MODEL_BATCH, span, env_steps, replay, RECENT)].split(columns, 2)
         model_loss = method.loss(s, a, displacement, skill, actor)
         share = min(span, 2 * UPDATES_PER_STEP)  # steps of a trajectory in the batch, two in each update: decoded and relabelled once
@@ -662,10 +677,10 @@ def train(method, config):
         skill[fresh] = method.sample(int(fresh.sum()))  # a copy: replay keeps its own
         s, a, s2, _, _ = replay[rows[torch.arange(len(rows)), t].flatten()].split(columns, 1)
         with torch.no_grad():
-            r, step = method.reward(moved[rows], t, skill, floor)
+            r, step, after = method.reward(moved[rows], t, skill, floor)
             skill = skill.repeat(share, 1)
             x, turns = actor.inputs(s, skill, step)
-            x2, _ = actor.inputs(s2, skill, step)
+            x2, _ = actor.inputs(s2, skill, after)
             a = actor.seen(a, turns)
         for i, small in enumerate(zip(*(v.split(BATCH) for v in (x, a, x2, r)))):
             losses = sac_losses(actor, critics, value, target, *small)

@@ -144,7 +144,7 @@ class Skills:
         content = load(OUT, "policy", self.policy, POLICY_SEED, quiet=True)
         self.actor, self.decoder, self.sha = load_actor(content), load_decoder(content), content["sha256"][:8]
         self.weight = content.get("relation_weight")  # DADS and SeCTAR have none: they hold their z
-        self.single = self.actor.net[0].in_features - len(self.actor.s_mean)  # entries of z that the policy is told
+        self.single = len(self.decoder.axes) - bool(self.weight)  # entries of z that the policy is told
         self.predictions = PREDICTIONS.split() if self.name == "wedis" else ["relation"] if self.weight else ["decoder"]
         self.top = torch.full((len(self.decoder.axes),), float(self.z_range))
         return self
@@ -274,7 +274,7 @@ def run(skills, cases):
                 planning[i] += time.perf_counter() - clock
                 plans[i].append((t * skills.hold, path[:1 + min(REPLAN or skills.length, skills.length - done)].numpy()))
         for _ in range(skills.hold):
-            _, unstable = robots.step(skills.actor.act(robots.observe(), z[:, :skills.single]).numpy())
+            _, unstable = robots.step(skills.actor.act(robots.observe(), z[:, :skills.single], t=0 if skills.weight else done).numpy())
             if (unstable & ~ended).any():
                 stop(f"MuJoCo found trial {(unstable & ~ended).argmax() % TRIALS} of {skills.maze} unstable; "
                      "choose another --seed or train the policy longer", code=1)

@@ -486,6 +486,7 @@ class Robots:
 
 # ---------------------------------------------------------------- the skill policy
 
+EXPLORER = 3.0  # the last entry of the z that means "explore" to SeCTAR's policy: far from N(0, I), and no plan asks for it
 ANKLES = torch.tensor([1.0, -1.0, -1.0, 1.0])  # legs 1 2 3 4: which way a bent ankle counts
 
 
@@ -519,8 +520,8 @@ def egocentric(s, step):
 
 class Actor(nn.Module):
     """pi_psi(a | s, z_single): a Gaussian squashed by tanh, Sec. 4.2.2. Normalises the state by fixed statistics. With a decoder it is
-    egocentric: it sees the step the decoder predicts for z instead of z, from the torso's heading. Egocentric without a decoder (DADS), it
-    takes z itself for a step and sees that turned."""
+    egocentric: it sees the step that the decoder predicts for z instead of z, from the torso's heading. Turned without a decoder (DADS), it
+    takes z itself for a step."""
 
     def __init__(self, s_dim, z_dim, a_dim, hidden, decoder=None, turned=False):
         super().__init__()
@@ -533,15 +534,19 @@ class Actor(nn.Module):
         self.register_buffer("told", torch.zeros(2, 0))  # speeds calibrated by 03: z_speed, evenly spaced, and what to say for it
 
     def inputs(self, s, z, step=None):
-        """s (B, n), z (B, m), step: the decoder's mean for z if it is known -> what the networks see (B, s_dim + z_dim) and by how
+        """s (B, n), z (B, m), step (B, 2): what z asks for, if it is known -> what the networks see (B, s_dim + z_dim) and by how
         many quarter turns the legs are counted on (B,)."""
         turns = torch.zeros(len(s), dtype=torch.int64)
         if self.turned:
             s, z, turns = egocentric(s, self.wanted(z) if step is None else step)
         return torch.cat([((s - self.s_mean) / self.s_std).clamp(-10, 10), z], -1), turns
 
-    def wanted(self, z):
-        return z if self.decoder is None else next(first_step(self.decoder, z))
+    def wanted(self, z, t=0):
+        """The step (B, 2) that z asks for at transition t: always WEDIS's first (the relation function moves z), SeCTAR's t-th."""
+        if self.decoder is None:
+            return z
+        step = self.decoder(nn.functional.pad(z, (0, len(self.decoder.axes) - z.shape[1])), t + 1)[0][:, t]
+        return torch.where(z[:, -1:] == EXPLORER, z[:, :2], step)
 
     def forward(self, x, deterministic=False):
         """x of inputs -> action (B, a_dim) in (-1, 1), log-probability (B,)."""
@@ -555,13 +560,13 @@ class Actor(nn.Module):
         return torch.tanh(u), log_prob.sum(-1)
 
     @torch.no_grad()
-    def act(self, s, z, deterministic=False):
+    def act(self, s, z, deterministic=False, t=0):
         """The action (B, a_dim) for the robot's own motors."""
         if self.told.numel():  # an asked speed -> the one to tell the policy, which would be late otherwise
             asked, tell = self.told
             at = ((z[:, 0] - asked[0]) / (asked[1] - asked[0])).clamp(0, len(asked) - 1.001)
             z = torch.cat([torch.lerp(tell[at.long()], tell[at.long() + 1], at.frac())[:, None], z[:, 1:]], 1)
-        x, turns = self.inputs(s, z)
+        x, turns = self.inputs(s, z, self.wanted(z, t))
         action, _ = self(x, deterministic)
         return self.seen(action, -turns)
 
@@ -583,11 +588,12 @@ def load_actor(content):
 @torch.no_grad()
 def execute(actor, robots, z, steps, hold, weight, deterministic):
     """Alg. 2, execution: hold z_single for `hold` (H_z) environment steps, move it by the relation function, `steps` (T) times.
-    z (n, M); weight None (DADS, SeCTAR): there is no relation function, the policy is told all of z and z stays. Yields
+    z (n, M); weight None (DADS, SeCTAR): there is no relation function, the policy is told all of z and at which transition it is. Yields
     after each environment step (for contacts, frames and stopping); the robots hold the state."""
-    for _ in range(steps):
+    for t in range(steps):
         for _ in range(hold):
-            yield robots.step(actor.act(robots.observe(), z if weight is None else single(z), deterministic).numpy())
+            told, at = (z, t) if weight is None else (single(z), 0)
+            yield robots.step(actor.act(robots.observe(), told, deterministic, at).numpy())
         z = z if weight is None else next_skill(z, weight)
 
 

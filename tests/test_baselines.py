@@ -60,7 +60,8 @@ def test_information_is_the_published_formula(stage, monkeypatch):
         away = (mixture(dads.decoder, others).log_prob(x[i].expand(100, -1)) - own).clamp(-50, 50)
         assert found[i].item() == pytest.approx(np.log(101) - np.log1p(away.double().exp().sum().item()), abs=2e-3)
     assert found.std() > 0.1
-    r, _ = dads.reward(displacement[:, None], None, z, 0.0)
+    r, told, after = dads.reward(displacement[:, None], None, z, 0.0)
+    assert told is z and after is z
     torch.testing.assert_close(r, s3.REWARD_SCALE * found)
 
 
@@ -95,7 +96,9 @@ def test_elbo_and_rewards_equal_torch_distributions(stage):
         sectar.encoder.head.bias[:8] = 3.0  # a divergence that counts
         sectar.decoder.head[2].bias[2:] = torch.tensor([-1.0, -9.0])  # the second coordinate's deviation is below every floor
         torch.manual_seed(1)
-        log_p, kl, z = sectar.elbo(x)
+        log_p, kl, steps = sectar.elbo(x)
+        torch.manual_seed(1)
+        z, _ = sectar.posterior(x)
         torch.manual_seed(1)
         mean, log_var = sectar.encoder(x)
         q = D.Independent(D.Normal(mean, (0.5 * log_var).exp()), 1)
@@ -105,43 +108,48 @@ def test_elbo_and_rewards_equal_torch_distributions(stage):
         def p(z, least):
             m, v = sectar.decoder(z, 50)
             return m, D.Normal(m, torch.maximum((0.5 * v).exp(), torch.tensor(least)))
+        torch.testing.assert_close(steps, p(z, 0.1)[0])
         torch.testing.assert_close(log_p, p(z, 0.1)[1].log_prob(x).sum((1, 2)), atol=1e-3, rtol=1e-4)
 
         skills = torch.randn(6, 8)
-        skills[4:] = s3.EXPLORER
+        skills[4:] = sectar.explorers(2)
         torch.manual_seed(1)
-        r, _ = sectar.reward(displacement, t, skills, floor)
+        r, told, after = sectar.reward(displacement, t, skills, floor)
         torch.manual_seed(1)
         z, kl = sectar.posterior(x[4:])
         for k, (n, i) in enumerate((n, i) for n in range(3) for i in range(6)):
             m, at = p(z[i - 4:i - 3], 0.1) if i > 3 else p(skills[i:i + 1], 0.5)
             here = at.log_prob(x[i]).sum(2)[0, t[n, i]]
-            expected = min(20.0, 2.0 * kl[i - 4] / 50 - here) if i > 3 else here - at.log_prob(m).sum(2)[0, t[n, i]]
-            assert r[k].item() == pytest.approx(0.1 * float(expected), abs=1e-4)
+            expected = 0.02 * min(10.0, 2.0 * kl[i - 4] / 50 - here) if i > 3 else 0.1 * (here - at.log_prob(m).sum(2)[0, t[n, i]])
+            assert r[k].item() == pytest.approx(float(expected), abs=1e-4)
+            m = skills[i, :2].expand(1, 50, 2) if i > 3 else m  # what the policy is told then and at the next step
+            torch.testing.assert_close(torch.stack([told[k], after[k]]), torch.stack([m[0, t[n, i]], m[0, min(49, t[n, i] + 1)]]))
 
 
 @pytest.mark.parametrize("stage", ["ant_sectar"], indirect=True)
 def test_cloning_moves_the_policy_towards_the_actions_and_reaches_the_encoder(stage):
     s3, sectar = stage
     torch.manual_seed(0)
-    actor, s, a = common.Actor(5, 8, 3, 16), torch.randn(4, 50, 5), torch.full((4, 50, 3), 0.7)
+    actor, s, a = common.Actor(26, 2, 8, 16, sectar.decoder), torch.randn(4, 50, 27), torch.full((4, 50, 8), 0.7)
     s3.KL_WEIGHT, s3.CLONING = 0.0, 1e6  # what is left is cloning
     loss = sectar.loss(s, a, 0.03 * torch.randn(4, 50, 2), None, actor)
     loss.backward()
     assert sectar.encoder.head.weight.grad.abs().sum() > 0
-    x = torch.cat([s[:, 0], torch.zeros(4, 8)], 1)
-    before = actor(x, deterministic=True)[0].mean()
+    x, turns = actor.inputs(s[:, 0], None, 0.1 * torch.randn(4, 2))
+    target = actor.seen(a[:, 0], turns)
+    before = (actor(x, deterministic=True)[0] - target).square().mean()
     with torch.no_grad():
         for parameter in actor.net.parameters():
             parameter -= 0.1 * parameter.grad / parameter.grad.norm()
-    assert before < actor(x, deterministic=True)[0].mean() < 0.7
+    assert (actor(x, deterministic=True)[0] - target).square().mean() < before
 
 
 @pytest.mark.parametrize("stage", ["ant_sectar"], indirect=True)
 def test_the_explorer_has_its_share_and_can_be_switched_off(stage):
     s3, sectar = stage
     z = sectar.sample(4000)
-    explorer = (z == s3.EXPLORER).all(1)
+    explorer = (z[:, 2:] == s3.EXPLORER).all(1)
+    torch.testing.assert_close(z[explorer, :2].norm(dim=1), torch.full((int(explorer.sum()),), s3.EXPLORER))
     assert explorer.float().mean() == pytest.approx(0.3, abs=0.03) and z[~explorer].std() == pytest.approx(1, abs=0.03)
     s3.EXPLORE = 0.0
     assert not (sectar.sample(4000) == s3.EXPLORER).any()
@@ -200,6 +208,11 @@ def test_both_baselines_from_the_command_line(made):
     assert {what for method, what in extra if method == "sectar"} >= {"reconstruction_error", "self_consistency_error", "explorer_coverage_cells"}
 
 
+def act_on_step(actor, s, step):
+    x, turns = actor.inputs(s, None, step)
+    return actor.seen(actor(x, True)[0], -turns)
+
+
 @pytest.mark.parametrize("method, z_dim, length, hold", [("dads", 2, 1, 20), ("sectar", 8, 40, 1)])
 def test_stage_4_loads_them_and_believes_them(made, s4, method, z_dim, length, hold, monkeypatch):
     """The same calls as for WEDIS: all of z goes to the policy, and what is promised is the mean of the method's own model."""
@@ -217,8 +230,13 @@ def test_stage_4_loads_them_and_believes_them(made, s4, method, z_dim, length, h
         one = 0.1 * decoder(z, length)[0].detach()
     torch.testing.assert_close(skills.promise(z, "decoder"), hold * one)
     robots = common.Robots(common.ant_spec(), 5)
-    action = skills.actor.act(robots.observe(), z[:, :skills.single], deterministic=True)
-    for _ in common.execute(skills.actor, robots, z, 1, 1, None, True):  # what 03 executes is what 04 does
+    walk = common.execute(skills.actor, robots, z, 3, 1, None, True)
+    for t in range(3):  # what 03 executes is what 04 does; SeCTAR's policy is told the decoded steps one after the other
+        action = skills.actor.act(robots.observe(), z[:, :skills.single], True, t)
+        step = z if method == "dads" else decoder(z, 3)[0][:, t].detach()
+        torch.testing.assert_close(action, skills.actor.act(robots.observe(), z, True) if method == "dads" else
+                                   act_on_step(skills.actor, robots.observe(), step))
+        next(walk)
         np.testing.assert_array_equal(robots.ctrl, action.numpy().astype(np.float64))
 
 
