@@ -15,7 +15,8 @@ from pathlib import Path
 
 import common  # before mujoco: it chooses how mujoco renders
 from common import (EXPLORER, Actor, Decoder, Robots, SkillDynamics, ant_spec, artifact_name, check_same, cross_talk, egocentric, execute,
-                    factors_of, first_step, load, load_actor, load_decoder, parse_flags, plt, predict, resumable, save, save_figure, stop, update_csv)
+                    factors_of, first_step, load, load_actor, load_decoder, parse_flags, plt, predict, read_csv, resumable, save, save_figure, stop,
+                    update_csv)
 import mujoco
 import numpy as np
 import torch
@@ -71,12 +72,10 @@ RECENT = 0               # latest steps that a baseline's model learns from, onc
 MODEL_BATCH = 0          # steps (DADS) or trajectories (SeCTAR) in a batch of theirs
 PRIOR_SAMPLES = 100      # L of DADS's reward
 MOMENTS = 0.02           # rate of the running mean and deviation that normalise DADS's targets
-EXPLORE = 0.3            # SeCTAR: share of trajectories that are the explorer's (0: no explorer)
+EXPLORE = 0.5            # SeCTAR: share of trajectories that are the explorer's (0: no explorer)
 KL_WEIGHT = 2.0          # SeCTAR
-CLONING = 1.0            # SeCTAR: weight of behaviour cloning (published: 100; the actor then imitates its own standing still)
+CLONING = 0.1            # SeCTAR: weight of behaviour cloning (published: 100; the mean of many lively actions is standing still)
 VAE_SCALE = 0.01         # of SeCTAR's loss beside SAC's; Adam does not notice, but for the actor: cloning against reward
-SURPRISE_SCALE = 0.02    # SeCTAR: the explorer's reward, of at most SURPRISE nats a step; it shares critics with the skills
-SURPRISE = 10.0
 
 CALIBRATED = 16          # starts at each speed from which told speeds are calibrated; 0: not (the paper)
 SPEEDS = 33              # speeds of that calibration, z_speed from -2 to 2
@@ -234,7 +233,7 @@ class Encoder(nn.Module):
 class Sectar:
     """Co-Reyes et al. 2018. Skills z ~ N(0, I) for SKILL_STEPS steps; a step is worth the state decoder's log-likelihood of it. Encoder,
     state decoder and, by cloning, the policy learn from the robots' own trajectories. The explorer is the same policy, told EXPLORER
-    instead of a skill, and worth the negative ELBO; skills begin where it ends, and it learns from their trajectories too."""
+    instead of a skill, and worth what the VAE cannot reconstruct; skills begin where it ends, and both learn from both's trajectories."""
     metric = "reconstruction error"
 
     def __init__(self):
@@ -261,18 +260,17 @@ class Sectar:
     def reward(self, displacement, t, z, floor):
         """displacement (K, T, 2) of whole trajectories, t (n, K): the steps of each that are asked for, z (K, AXES) -> (n K,), and
         what the policy is told at t and after it (n K, 2)."""
-        x, explorer, i, kl = displacement / STEP_SCALE, z[:, -1] == EXPLORER, torch.arange(len(z)), torch.zeros(len(z))
-        told = z
+        x, explorer, i, told = displacement / STEP_SCALE, z[:, -1] == EXPLORER, torch.arange(len(z)), z
         if explorer.any():
             z = z.clone()
-            z[explorer], kl[explorer] = self.posterior(x[explorer])
+            z[explorer], _ = self.posterior(x[explorer])
         mean, log_var = self.decode(z, FLOOR_END)
-        steps = torch.where(explorer[:, None, None], told[:, None, :2], mean)
-        x, mean, log_var = x[i, t], mean[i, t], log_var[i, t]
-        surprise = 0.5 * (log_var + math.log(2 * math.pi) + (x - mean) ** 2 / log_var.exp()).sum(2) + KL_WEIGHT * kl / SKILL_STEPS
-        # of a skill less its value at the mean, as WEDIS's: what depends on z and t alone does not change what is best
-        follow = -0.5 * ((x - mean) ** 2 / log_var.exp().clamp(min=(floor / STEP_SCALE) ** 2)).sum(2)
-        r = torch.where(explorer, SURPRISE_SCALE * surprise.clamp(max=SURPRISE), REWARD_SCALE * follow)
+        steps, miss = torch.where(explorer[:, None, None], told[:, None, :2], mean), x - mean
+        # the explorer: by how much its trajectory ends elsewhere than decoded, shared among its steps; single steps would teach it to tremble
+        novelty = (miss * nn.functional.normalize(miss.sum(1))[:, None]).sum(2)[i, t]
+        # a skill: less its value at the mean, as WEDIS's; what depends on z and t alone does not change what is best
+        follow = -0.5 * (miss ** 2 / (VARIANCE_SCALE * log_var.exp()).clamp(min=(floor / STEP_SCALE) ** 2)).sum(2)[i, t]
+        r = REWARD_SCALE * torch.where(explorer, novelty, follow)
         return r.flatten(), *(steps[i, u].flatten(0, 1) for u in (t, (t + 1).clamp(max=SKILL_STEPS - 1)))
 
     def elbo(self, x):
@@ -282,13 +280,15 @@ class Sectar:
         return -0.5 * (log_var + math.log(2 * math.pi) + (x - mean) ** 2 / log_var.exp()).sum((1, 2)), kl, mean
 
     def loss(self, s, a, displacement, z, actor):
-        """Negative ELBO of recent trajectories and cloning of eight actions of each, by the policy told q's z. It reaches the encoder too."""
+        """Negative ELBO of the explorer's recent trajectories (without one: of all) and cloning of eight actions of each, by the policy told
+        what is decoded from q's z. Skills that stand still would teach the prior to stand still."""
+        mine = (z[:, 0, -1] == EXPLORER) | (EXPLORE == 0)
         log_p, kl, steps = self.elbo(displacement / STEP_SCALE)
         i, t = torch.arange(len(s))[:, None], torch.randint(SKILL_STEPS, (len(s), 8))
         x, turns = actor.inputs(s[i, t].flatten(0, 1), None, steps[i, t].flatten(0, 1))
         action, _ = actor(x, deterministic=True)
-        miss = 0.5 * ((action - actor.seen(a[i, t].flatten(0, 1), turns)) ** 2).sum(1)
-        return VAE_SCALE * ((KL_WEIGHT * kl - log_p).mean() + CLONING * miss.mean())
+        miss = 0.5 * ((action - actor.seen(a[i, t].flatten(0, 1), turns)) ** 2).sum(1).view(-1, 8).mean(1)
+        return VAE_SCALE * ((KL_WEIGHT * kl - log_p + CLONING * miss) * mine).sum() / mine.sum().clamp(min=1)
 
     def reconstruction_error(self, x):
         """Displacements (B, T, 2) in trajectory units -> RMS over all places of (decoded from q's mean - executed) / RMS executed."""
@@ -345,20 +345,32 @@ def grid():
     return nn.functional.pad(torch.cartesian_prod(torch.linspace(-1.5, 1.5, 5), directions), (0, 1))
 
 
+def walk(actor, z, steps, hold, weight, deterministic=True, noise=None, run_in=0):
+    """Skills z (n, M) executed: all poses (n, steps * hold + 1, nq). From rest, or with noise, a generator, from noisy starts; recorded after
+    a run-in (from rest the first step is short and looks like acceleration)."""
+    robots = make_robots(len(z))
+    if noise is not None:
+        robots.reset(np.arange(len(z)), noise)
+    for _ in execute(actor, robots, z, 1, run_in, weight, deterministic):
+        pass
+    return np.stack([robots.qpos.copy(), *(robots.qpos.copy() for _ in execute(actor, robots, z, steps, hold, weight, deterministic))], 1)
+
+
+def paths(*skills, **how):
+    """The places of walk, (n, steps * hold + 1, 2 or 1) in metres."""
+    return walk(*skills, **how)[..., :2 if ROBOT == "ant" else 1]
+
+
 def grid_run(actor, decoder, deterministic=True):
     """The tracking grid walked from rest for LENGTH skills' steps T of HOLD steps H_z. Returns executed and predicted end points (n, 2 or
     1) in metres, of the baselines from the shortest prediction to the longest, and which robots were ever upside down (n,)."""
     z = grid()
-    robots, flipped = make_robots(len(z)), np.zeros(len(z), bool)
-    for _ in execute(actor, robots, z, LENGTH, HOLD, 0.0 if METHOD == "wedis" else None, deterministic):
-        if ROBOT == "ant":
-            x, y = robots.qpos[:, 4:6].T  # of the torso's quaternion; its up-vector has height 1 - 2 (x^2 + y^2)
-            flipped |= 1 - 2 * (x ** 2 + y ** 2) < 0
-        else:
-            flipped |= np.cos(robots.qpos[:, 2]) < 0
+    poses = walk(actor, z, LENGTH, HOLD, 0.0 if METHOD == "wedis" else None, deterministic)
+    # the up-vector of the torso: its quaternion's x and y tell its height, 1 - 2 (x^2 + y^2); on a rail the pitch does
+    up = 1 - 2 * (poses[..., 4:6] ** 2).sum(2) if ROBOT == "ant" else np.cos(poses[..., 2])
     predicted = (HOLD * STEP_SCALE * predict(decoder, z, LENGTH).sum(1)).double().numpy()
     order = slice(None) if METHOD == "wedis" else np.argsort((predicted ** 2).sum(1))
-    return robots.qpos[:, :robots.place][order].copy(), predicted[order], flipped
+    return poses[order, -1, :predicted.shape[1]], predicted[order], (up < 0).any(1)
 
 
 def tracking(executed, predicted):
@@ -377,21 +389,6 @@ def by_speed(values):
     """Mean over the slow, the middle and the fast of what tracking returns by speed."""
     n = (len(values) - 1) // 2
     return [float(part.mean()) for part in np.split(values, [n, len(values) - n])]
-
-
-def paths(actor, z, steps, hold, weight, deterministic=True, starts=0):
-    """Executed positions (n, steps * hold + 1, 2 or 1) in metres of skills z (n, M) from rest, mean actions unless told. starts: the mean
-    over so many noisy starts instead, after a run-in of `hold` steps (from rest the first step is short and looks like acceleration)."""
-    n, z = len(z), z.repeat(max(1, starts), 1)
-    robots = make_robots(len(z))
-    if starts:
-        robots.reset(np.arange(len(z)), np.random.default_rng(SEED + 2))
-        for _ in execute(actor, robots, z, 1, hold, weight, deterministic):
-            pass
-    track = [robots.qpos[:, :robots.place].copy()]
-    for _ in execute(actor, robots, z, steps, hold, weight, deterministic):
-        track.append(robots.qpos[:, :robots.place].copy())
-    return np.stack(track, 1).reshape(-1, n, len(track), robots.place).mean(0)
 
 
 def traversal(axis, values):
@@ -438,12 +435,8 @@ def calibrate_speeds(actor, decoder):
     z = torch.linspace(-2, 2, SPEEDS)
     skills = nn.functional.pad(torch.cartesian_prod(z, 3 * torch.rand(CALIBRATED) - 1.5), (0, 1)) if ROBOT == "ant" else (
         nn.functional.pad(z.repeat_interleave(CALIBRATED)[:, None], (0, 1)))
-    robots = make_robots(len(skills))
-    robots.reset(np.arange(len(skills)), np.random.default_rng(SEED + 1))  # not the starts of the tracking grid
-    step, places = predict(decoder, skills, 1)[:, 0].double().numpy(), []
-    for _ in execute(actor, robots, skills, 1, EPISODE, 0.0, deterministic=True):
-        places.append(robots.qpos[:, :robots.place].copy())
-    walked = (places[-1] - places[EPISODE // 2 - 1]) / (EPISODE // 2 * STEP_SCALE)
+    step, track = predict(decoder, skills, 1)[:, 0].double().numpy(), paths(actor, skills, 1, EPISODE, 0.0, noise=np.random.default_rng(SEED + 1))
+    walked = (track[:, -1] - track[:, EPISODE // 2]) / (EPISODE // 2 * STEP_SCALE)
     if ROBOT == "ant":  # along the step; on a rail the sign counts
         walked, step = (walked * step).sum(1, keepdims=True) / np.linalg.norm(step, axis=1, keepdims=True), np.linalg.norm(step, axis=1)
     asked, achieved = (v.reshape(len(z), CALIBRATED).mean(1) for v in (step, walked))
@@ -486,20 +479,27 @@ def draw_skills(actor, decoder, weight, name, columns):
     save_figure(figure, OUT, name)
 
 
-def draw_learning_curve(curve):
-    """Tracking error and achieved speeds, of a baseline also its own metric, against the minutes of training."""
-    figure, (error, returns, *own) = plt.subplots(1, 3 if "metric" in curve[0] else 2, figsize=(12 if "metric" in curve[0] else 8, 3))
-    minutes = [row["minutes"] for row in curve]
-    error.plot(minutes, [row["tracking_error"] for row in curve], ".-", color=common.BLUE)
-    error.set(xlabel=f"minutes of training ({THREADS} thread{'s' * (THREADS > 1)})", ylabel=f"tracking error ({len(grid())} skills)", ylim=(0, 1.1))
-    for name, colour in (("slow", common.GREY), ("mid", common.RED), ("fast", common.BLUE)):
-        returns.plot(minutes, [row["speed_" + name] for row in curve], ".-", color=colour, label=name)
-    returns.axhline(1, color="black", lw=0.8, ls="--")
-    returns.set(xlabel=error.get_xlabel(), ylabel="achieved / commanded speed", ylim=(-0.1, 1.3))
-    returns.legend()
-    for ax in own:
-        ax.plot(minutes, [row["metric"] for row in curve], ".-", color=common.BLUE)
-        ax.set(xlabel=error.get_xlabel(), ylabel=f"{METHODS[METHOD].metric}, recent steps")
+def write_curve(curve):
+    update_csv(Path(OUT) / "results" / f"learning_curve_{EXPERIMENT}_seed{SEED}.csv", curve, ())
+
+
+def draw_learning_curve():
+    """Tracking error and achieved speeds, of a baseline also its own metric, against the minutes of training; a line per seed."""
+    curves = [read_csv(path) for path in sorted((Path(OUT) / "results").glob(f"learning_curve_{EXPERIMENT}_seed*.csv"))]
+    own = "metric" in curves[0][0]
+    figure, axes = plt.subplots(1, 2 + own, figsize=(8 + 4 * own, 3))
+    for n, curve in enumerate(curves):
+        column = {name: [float(row[name]) for row in curve] for name in curve[0]}
+        for ax, names in zip(axes, (dict(tracking_error=common.BLUE), dict(speed_slow=common.GREY, speed_mid=common.RED, speed_fast=common.BLUE),
+                                    dict(metric=common.BLUE))):
+            for name, colour in names.items():
+                ax.plot(column["minutes"], column[name], "-", lw=1.2, color=colour, label=name.removeprefix("speed_") if n == 0 else None)
+    for ax, label in zip(axes, (f"tracking error ({len(grid())} skills)", "achieved / commanded speed", f"{METHODS[METHOD].metric}, recent steps")):
+        ax.set(xlabel=f"minutes of training ({THREADS} thread{'s' * (THREADS > 1)}), {len(curves)} seed{'s' * (len(curves) > 1)}", ylabel=label)
+    axes[0].set(ylim=(0, 1.1))
+    axes[1].set(ylim=(-0.1, 1.3))
+    axes[1].axhline(1, color="black", lw=0.8, ls="--")
+    axes[1].legend()
     save_figure(figure, OUT, f"learning_curve_{EXPERIMENT}")
 
 
@@ -622,7 +622,7 @@ def train(method, config):
         slow, mid, fast = by_speed(ratio)
         curve.append(dict(updates=updates, env_steps=env_steps, minutes=seconds / 60, tracking_error=float(error), reward=r.mean().item(),
                           direction_deg=float(degrees[2:].mean()), speed_slow=slow, speed_mid=mid, speed_fast=fast) | own)
-        update_csv(Path(OUT) / "results" / f"learning_curve_{EXPERIMENT}_seed{SEED}.csv", curve, ())
+        write_curve(curve)
         print(f"{updates:7d} updates {env_steps:8d} steps  tracking error {error:.3f}  direction {degrees[2:].mean():5.1f} deg  speed x "
               f"{slow:.2f} {mid:.2f} {fast:.2f}  reward {r.mean():6.3f}  floor {floor:.3f}  "
               + "".join(f"{method.metric} {v:.3f}  " for v in own.values()) +
@@ -772,8 +772,10 @@ if __name__ == "__main__":
     torch.manual_seed(SEED)
     error_sampled, *_ = tracking(*grid_run(actor, decoder, deterministic=False)[:2])
     accelerating = "acceleration" in names
-    profiles = [np.diff(paths(actor, traversal(i, values), 5, PROFILE, weight, starts=STARTS)[:, ::PROFILE], axis=1) / (PROFILE * STEP_SCALE)
-                for i in range(AXES)]
+    profiles = []
+    for i in range(AXES):  # the mean over noisy starts
+        track = paths(actor, traversal(i, values).repeat(STARTS, 1), 5, PROFILE, weight, noise=np.random.default_rng(SEED + 2), run_in=PROFILE)
+        profiles.append(np.diff(track[:, ::PROFILE], axis=1).reshape(STARTS, TRAVERSAL, 5, -1).mean(0) / (PROFILE * STEP_SCALE))
     C, purity = cross_talk([factors_of(profile, accelerating) for profile in profiles], names, ranges)
     if METHOD == "wedis":
         skills = nn.functional.pad(torch.randn(COVERAGE, len(names) - 1), (0, 1))
@@ -814,5 +816,6 @@ if __name__ == "__main__":
         "half_cheetah": ("fig16_half_cheetah", [("$z_{speed}$", 0, np.linspace(-1, 1, 9), 6, 20), ("$z_{acc}$", 1, np.linspace(-1, 1, 9), 6, 20)]),
     }[EXPERIMENT])
     if policy["curve"]:
-        draw_learning_curve(policy["curve"])
+        write_curve(policy["curve"])
+        draw_learning_curve()
     draw_robots()
