@@ -67,7 +67,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
     "speed_acc": dict(EPOCHS=24, BETA=4.0, DATA="speed_acc", LABELS="velocity acceleration", BASE="-1 0", MODELS={"": {}, "none": NONE},
                       FIGURE="fig12_speed_acceleration", COLUMNS=[("WET-VAE", "speed_acc", 5), ("no labels", "speed_acc_none", 5)]),
     "four_factors": dict(
-        EPOCHS=36, BETA=5.0, DATA="four_factors", LABELS="speed angle curvature acceleration", MODELS={"": {}, "circle": dict(CIRCLE=True)},
+        EPOCHS=60, BETA=4.0, DATA="four_factors", LABELS="speed angle curvature acceleration", MODELS={"": {}, "circle": dict(CIRCLE=True)},
         FIGURE="fig13_four_factors", COLUMNS=[("Gaussian axis", "four_factors", 5), ("circle", "four_factors_circle", 5)]),
     "full": dict(
         DATA="full", LABELS="speed angle curvature", MODELS={"": {}, "circle": dict(CIRCLE=True)},

@@ -91,7 +91,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
     # the baselines train by the clock, as long as WEDIS takes
     "ant_dads": dict(METHOD="dads", AXES=2, Z_RANGE=1.0, SKILL_STEPS=200, RECENT=10_000, MODEL_BATCH=256, MINUTES=45.0),
     "ant_sectar": (SECTAR := dict(METHOD="sectar", AXES=8, LENGTH=50, HOLD=1, PROFILE=10, SKILL_STEPS=50, RECENT=128_000,
-                                  MODEL_BATCH=64, MINUTES=45.0)),
+                                  MODEL_BATCH=128, REWARD_SCALE=0.3, MINUTES=45.0)),
     "ant_sectar_no_explorer": SECTAR | dict(EXPLORE=0.0),  # what the explorer is good for
 }
 FACTORS = dict(speed=1.0, direction=2 * math.pi, curvature=math.pi / 3)  # of which the baselines' axes know nothing: full ranges, Table 1
@@ -231,8 +231,8 @@ class Encoder(nn.Module):
 
 
 class Sectar:
-    """Co-Reyes et al. 2018. Skills z ~ N(0, I) for SKILL_STEPS steps; a step is worth the state decoder's log-likelihood of it. Encoder,
-    state decoder and, by cloning, the policy learn from the robots' own trajectories. The explorer is the same policy, told EXPLORER
+    """Co-Reyes et al. 2018. Skills z ~ N(0, I) for SKILL_STEPS steps, worth the likelihood of ending where the state decoder says. Encoder,
+    state decoder and, by cloning, the policy learn from the explorer's trajectories. The explorer is the same policy, told EXPLORER
     instead of a skill, and worth what the VAE cannot reconstruct; skills begin where it ends, and both learn from both's trajectories."""
     metric = "reconstruction error"
 
@@ -252,10 +252,10 @@ class Sectar:
         mean, log_var = self.encoder(x)
         return mean + (0.5 * log_var).exp() * torch.randn_like(mean), 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1)
 
-    def decode(self, z, floor):
+    def decode(self, z):
         """Mean and log-variance (B, SKILL_STEPS, 2) in trajectory units. Without a floor the likelihood of standing still has no bound."""
         mean, log_var = self.decoder.unroll(z, SKILL_STEPS)
-        return mean, log_var.clamp(min=2 * math.log(floor / STEP_SCALE))
+        return mean, log_var.clamp(min=2 * math.log(FLOOR_END / STEP_SCALE))
 
     def reward(self, displacement, t, z, floor):
         """displacement (K, T, 2) of whole trajectories, t (n, K): the steps of each that are asked for, z (K, AXES) -> (n K,), and
@@ -264,19 +264,18 @@ class Sectar:
         if explorer.any():
             z = z.clone()
             z[explorer], _ = self.posterior(x[explorer])
-        mean, log_var = self.decode(z, FLOOR_END)
+        mean, _ = self.decode(z)
         steps, miss = torch.where(explorer[:, None, None], told[:, None, :2], mean), x - mean
-        # the explorer: by how much its trajectory ends elsewhere than decoded, shared among its steps; single steps would teach it to tremble
-        novelty = (miss * nn.functional.normalize(miss.sum(1))[:, None]).sum(2)[i, t]
-        # a skill: less its value at the mean, as WEDIS's; what depends on z and t alone does not change what is best
-        follow = -0.5 * (miss ** 2 / (VARIANCE_SCALE * log_var.exp()).clamp(min=(floor / STEP_SCALE) ** 2)).sum(2)[i, t]
-        r = REWARD_SCALE * torch.where(explorer, novelty, follow)
+        # how far from the decoded place a trajectory ends (a Laplace likelihood of the place), shared among its steps; by single steps
+        # a skill would be paid for not trembling, which is standing still, and the explorer for trembling
+        away = (miss * nn.functional.normalize(miss.sum(1))[:, None]).sum(2)[i, t]
+        r = REWARD_SCALE * torch.where(explorer, away, -away)
         return r.flatten(), *(steps[i, u].flatten(0, 1) for u in (t, (t + 1).clamp(max=SKILL_STEPS - 1)))
 
     def elbo(self, x):
         """Displacements (B, T, 2) in trajectory units -> sum_t log p(x_t | z), KL(q || p), both (B,), and the decoded means (B, T, 2)."""
         z, kl = self.posterior(x)
-        mean, log_var = self.decode(z, FLOOR_END)
+        mean, log_var = self.decode(z)
         return -0.5 * (log_var + math.log(2 * math.pi) + (x - mean) ** 2 / log_var.exp()).sum((1, 2)), kl, mean
 
     def loss(self, s, a, displacement, z, actor):
@@ -293,7 +292,7 @@ class Sectar:
     def reconstruction_error(self, x):
         """Displacements (B, T, 2) in trajectory units -> RMS over all places of (decoded from q's mean - executed) / RMS executed."""
         path = x.cumsum(1)
-        return ((self.decode(self.encoder(x)[0], FLOOR_END)[0].cumsum(1) - path).square().mean() / path.square().mean()).sqrt().item()
+        return ((self.decode(self.encoder(x)[0])[0].cumsum(1) - path).square().mean() / path.square().mean()).sqrt().item()
 
     def measure(self, displacement, z):
         return self.reconstruction_error(displacement / STEP_SCALE)

@@ -32,6 +32,7 @@ REWARDS = "dense sparse"   # Sec. 6.2
 PREDICTIONS = "relation decoder"  # what the planner believes: the relation function's path, or the decoder's T free steps (the paper)
 OBJECTIVES = "final"       # reward of the last planned state, or "sum" over all of them (the paper does not say)
 TRIALS = 50                # per configuration; all step together
+MEAN_ACTIONS = True        # of the policy, which falls less often so; false: sampled ones (the paper does not say)
 RESUME = True              # figure7 skips what its CSV holds already; false: begins anew
 ANIMATE = True             # false: no GIFs
 
@@ -74,7 +75,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
     "best": dict(PREDICTIONS="relation", SAMPLE_SIZES="100 1000", PLANNER="cem", REPLAN=1, WARM=True, MARGIN=0.5, STOP_AT_GOAL=1.0,
                  TIE_BREAK=True, SLOW_NEAR=5.0),
 }
-OPTIONS = ("PLANNER", "REPLAN", "WARM", "MARGIN", "STOP_AT_GOAL", "TIE_BREAK", "SLOW_NEAR")
+OPTIONS = ("MEAN_ACTIONS", "PLANNER", "REPLAN", "WARM", "MARGIN", "STOP_AT_GOAL", "TIE_BREAK", "SLOW_NEAR")
 PAPER = {name: globals()[name] for name in OPTIONS}
 
 METHODS = {  # Table 2: the constants in which a method differs from WEDIS
@@ -144,8 +145,8 @@ class Skills:
         content = load(OUT, "policy", self.policy, POLICY_SEED, quiet=True)
         self.actor, self.decoder, self.sha = load_actor(content), load_decoder(content), content["sha256"][:8]
         self.weight = content.get("relation_weight")  # DADS and SeCTAR have none: they hold their z
-        self.single = len(self.decoder.axes) - bool(self.weight)  # entries of z that the policy is told
-        self.predictions = PREDICTIONS.split() if self.name == "wedis" else ["relation"] if self.weight else ["decoder"]
+        self.single = len(self.decoder.axes) - (self.weight is not None)  # entries of z that the policy is told
+        self.predictions = PREDICTIONS.split() if self.name == "wedis" else ["decoder"] if self.weight is None else ["relation"]
         self.top = torch.full((len(self.decoder.axes),), float(self.z_range))
         return self
 
@@ -239,7 +240,7 @@ def plan(skills, case, start, horizon, first, warm, generator):
         elite = scores.topk(min(len(scores), max(3, int(CEM_ELITES * case.samples / rounds)))).indices
         if scores[elite[0]] > scores[elite[-1]]:  # else all alike, as with a sparse reward: nothing to draw towards
             deviation = tried[elite].std(0) + 0.02
-    return tried[elite[0]], paths[elite[0]]
+    return tried[elite[0]].clone(), paths[elite[0]].clone()  # the trap: a view would keep all N paths of every decision in memory
 
 
 def run(skills, cases):
@@ -274,7 +275,8 @@ def run(skills, cases):
                 planning[i] += time.perf_counter() - clock
                 plans[i].append((t * skills.hold, path[:1 + min(REPLAN or skills.length, skills.length - done)].numpy()))
         for _ in range(skills.hold):
-            _, unstable = robots.step(skills.actor.act(robots.observe(), z[:, :skills.single], t=0 if skills.weight else done).numpy())
+            at = done if skills.weight is None else 0  # SeCTAR's policy walks its steps one by one
+            _, unstable = robots.step(skills.actor.act(robots.observe(), z[:, :skills.single], MEAN_ACTIONS, at).numpy())
             if (unstable & ~ended).any():
                 stop(f"MuJoCo found trial {(unstable & ~ended).argmax() % TRIALS} of {skills.maze} unstable; "
                      "choose another --seed or train the policy longer", code=1)
@@ -284,7 +286,7 @@ def run(skills, cases):
             distance = np.hypot(*(pose[:, :2] - skills.goal).T)
             best = np.minimum(best, distance)
             ended |= (best < STOP_AT_GOAL) & (distance > best + 0.05)
-        if skills.weight:
+        if skills.weight is not None:
             z = next_skill(z, skills.weight)
     poses = np.stack(poses, 1)
     distance = np.linalg.norm(poses[..., :2] - skills.goal, axis=2)

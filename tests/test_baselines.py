@@ -88,8 +88,7 @@ def test_skill_dynamics_learn_what_skills_do(stage):
 
 @pytest.mark.parametrize("stage", ["ant_sectar"], indirect=True)
 def test_elbo_and_rewards_equal_torch_distributions(stage):
-    """A skill's step: log p(step | z, t) less its value at the mean, the deviation floored; the explorer's steps: together how far from
-    the reconstruction they end."""
+    """The steps of a trajectory are together worth how far from the decoded place it ends: to a skill as a cost, to the explorer as a gain."""
     s3, sectar = stage
     displacement, t, floor = 0.03 * torch.randn(6, 50, 2), torch.randint(50, (3, 6)), 0.05
     x = displacement / 0.1
@@ -106,9 +105,9 @@ def test_elbo_and_rewards_equal_torch_distributions(stage):
         torch.testing.assert_close(z, mean + (0.5 * log_var).exp() * torch.randn(6, 8))
         torch.testing.assert_close(kl, D.kl_divergence(q, D.Independent(D.Normal(torch.zeros(6, 8), 1.0), 1)))
 
-        def p(z, least, scale=1.0):
+        def p(z, least):
             m, v = sectar.decoder(z, 50)
-            return m, D.Normal(m, torch.maximum((scale * v.exp()).sqrt(), torch.tensor(least)))
+            return m, D.Normal(m, torch.maximum((0.5 * v).exp(), torch.tensor(least)))
         torch.testing.assert_close(steps, p(z, 0.1)[0])
         torch.testing.assert_close(log_p, p(z, 0.1)[1].log_prob(x).sum((1, 2)), atol=1e-3, rtol=1e-4)
 
@@ -119,9 +118,9 @@ def test_elbo_and_rewards_equal_torch_distributions(stage):
         torch.manual_seed(1)
         z, _ = sectar.posterior(x[4:])
         for k, (n, i) in enumerate((n, i) for n in range(3) for i in range(6)):
-            m, at = p(z[i - 4:i - 3], 0.1) if i > 3 else p(skills[i:i + 1], 0.5, 1 / 20)
-            here, away = at.log_prob(x[i]).sum(2)[0, t[n, i]], (x[i] - m[0]).sum(0)
-            expected = 0.1 * ((x[i] - m[0])[t[n, i]] @ away / away.norm() if i > 3 else here - at.log_prob(m).sum(2)[0, t[n, i]])
+            m, _ = p(z[i - 4:i - 3] if i > 3 else skills[i:i + 1], 0.1)
+            away = (x[i] - m[0]).sum(0)
+            expected = 0.3 * (1 if i > 3 else -1) * (x[i] - m[0])[t[n, i]] @ away / away.norm()
             assert r[k].item() == pytest.approx(float(expected), abs=1e-4)
             m = skills[i, :2].expand(1, 50, 2) if i > 3 else m  # what the policy is told then and at the next step
             torch.testing.assert_close(torch.stack([told[k], after[k]]), torch.stack([m[0, t[n, i]], m[0, min(49, t[n, i] + 1)]]))

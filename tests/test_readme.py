@@ -16,9 +16,7 @@ def num(text, form):
 
 def tables():
     """Markdown of each table, from the CSV files alone."""
-    results = {name: common.read_csv(ROOT / "results" / f"{name}.csv") for name in ("wetvae", "policies", "mazes", "bench", "baselines")
-               if (ROOT / "results" / f"{name}.csv").exists()}
-    results.setdefault("baselines", [])  # until they are trained
+    results = {path.stem: common.read_csv(path) for path in (ROOT / "results").glob("*.csv")}
     head = "| {} | axis | \\|corr\\| | purity | decoded range over z in [-1.5, 1.5] | MIG | SAP | seed |"
     wetvae, others = ([head.format(name), "|---" * 8 + "|"] for name in ("model", "experiment, labels, β, γ"))
     for r in results["wetvae"]:
@@ -66,20 +64,42 @@ def tables():
         f"| {r['method']} | {r['seed']} | {r['what'].replace('_', ' ')} | {num(r['value'], '.3f')} |" for r in results["baselines"]]
     stage = script("04_mpc_maze")
     key = lambda r: (r["maze"], r["objective"], r["reward"], r["prediction"], r["seed"])  # noqa: E731
-    ordered = sorted(results["mazes"], key=lambda r: (r["maze"], r["objective"], r["reward"], r["prediction"] == "decoder", r["seed"]))
+    results["sum"] = [r for r in results["mazes"] if r["objective"] == "sum"]
+    ordered = sorted((r for r in results["mazes"] if r["objective"] == "final"),
+                     key=lambda r: (r["maze"], r["objective"], r["reward"], r["prediction"] == "decoder", r["seed"]))
     mazes = stage.HEADER.split("\n") + [stage.summary(list(rows)) for _, rows in groupby(ordered, key)]
     bench = ["| what | ours | peer | ratio | unit |", "|---" * 5 + "|"]
     for r in results["bench"]:
         bench.append(f"| {r['what']} | {num(r['ours'], '.0f')} | {num(r['peer'], '.0f')}, {r['peer_name']} | {num(r['ratio'], '.2f')} | "
                      f"{r['unit']} |")
-    return dict(wetvae=wetvae, others=others, seeds=seeds, policies=policies, mazes=mazes, baselines=baselines, bench=bench)
+    groups = {}
+    for r in results["figure7"]:
+        groups.setdefault((r["method"], r["prediction"], int(r["samples"])), {}).setdefault((r["maze"], r["reward"]), []).append(r)
+    panels = [(maze, reward) for maze in ("maze1", "maze2") for reward in ("dense", "sparse")]
+    planning = ["| method | N | " + " | ".join(f"Maze {maze[4]}, {reward}" for maze, reward in panels) + " |", "|---" * 6 + "|"]
+    for (method, prediction, samples), cells in groups.items():
+        if samples in (10, 100, 1000):
+            planning.append(f"| {stage.LOOK[method, prediction]} | {samples} | " + " | ".join(
+                "{:.1f} ({:.1f} .. {:.1f}), {:.0f} %".format(stage.distances(rows).mean(), *common.bootstrap_interval(stage.distances(rows)),
+                                                             100 * np.mean([int(r["success"]) for r in rows]))
+                for rows in (cells[panel] for panel in panels)) + " |")
+    options = ["| experiment, method | N | steps ahead " + stage.HEADER.split("\n")[0][:-1] + "| path (m) |", "|---" * 14 + "|"]
+    for name in ("best", "fig18", "matched", "sum"):
+        for _, rows in groupby(results[name], lambda r: tuple(r[k] for k in stage.KEY[:-1])):
+            rows = list(rows)
+            options.append(f"| {name}, {rows[0]['method']} | {rows[0]['samples']} | {rows[0]['look_ahead']} {stage.summary(rows)[:-1]}| "
+                           f"{np.mean([float(r['path_length']) for r in rows]):.1f} |")
+    return dict(wetvae=wetvae, others=others, seeds=seeds, policies=policies, mazes=mazes, baselines=baselines, bench=bench, planning=planning,
+                options=options, table2=stage.markdown(results["table2"]).split("\n"),
+                claims=stage.markdown(stage.verdicts(results["claims"])).split("\n"))
 
 
 def between(name):
     return re.compile(rf"(<!-- table {name} -->\n)(.*?)(<!-- end -->)", re.S)
 
 
-@pytest.mark.parametrize("name", ["wetvae", "others", "seeds", "policies", "baselines", "mazes", "bench"])
+@pytest.mark.parametrize("name", ["wetvae", "others", "seeds", "policies", "baselines", "mazes", "planning", "claims", "options", "table2",
+                                  "bench"])
 def test_tables_are_those_of_the_results(name):
     assert between(name).search(README.read_text())[2].strip().split("\n") == tables()[name]
 
