@@ -137,6 +137,8 @@ def toy(s4, samples, planner, seed, warm=None):
     skills.top, skills.promise = torch.full((3,), 1.5), promise
     z, path = s4.plan(skills, case(samples=samples), torch.zeros(2), 3, 5, warm, torch.Generator().manual_seed(seed))
     s4.score = score
+    for kept in (z, path):  # not views that keep all N in memory
+        assert kept.untyped_storage().nbytes() == kept.numel() * kept.element_size()
     hit = s4.collides(path[None], skills.walls, s4.RADIUS).any()
     return 1000 if hit else float((path[-1] - torch.tensor(s4.GOAL)).norm()), sum(rolled_out), z
 
