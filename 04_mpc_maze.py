@@ -456,8 +456,8 @@ def draw_fig07(rows):
                 ax.errorbar(np.array(sizes) * beside, mean, [mean - low, high - mean], marker=marker, color=colour, label=label,
                             ms=4, lw=1.2, capsize=2)
         ax.axhline(math.dist(GOAL, START), color=common.GREY, ls="--", lw=1)
-        ax.set(xscale="log", ylim=(0, 29), title=f"Maze {maze[-1]}, {reward} reward")
-    axes[0, 0].annotate("staying at the start", (10, 27.1), fontsize=8, color="#555555")
+        ax.set(xscale="log", ylim=(0, 30), title=f"Maze {maze[-1]}, {reward} reward")
+    axes[0, 0].annotate("staying at the start", (10, math.dist(GOAL, START)), (0, 2), textcoords="offset points", fontsize=8, color="#555555")
     for ax in axes[1]:
         ax.set_xlabel("samples per plan, N")
     figure.supylabel("mean final distance to the goal (m), 95 % interval", fontsize=9)
