@@ -58,7 +58,7 @@ RELABELLED = 0.5         # share of a batch given a fresh skill from the prior (
 EGOCENTRIC = True        # the networks see state and wanted step from the torso, up to quarter turns (false: s and z, the paper)
 HIDDEN = 256             # width of the two hidden layers (the paper: 512)
 LEARNING_RATE = 1e-3     # Adam (the paper: 3e-4, fixed)
-DECAY_FROM = 0.5         # share of the updates after which the learning rate falls linearly to 0
+DECAY_FROM = 0.5         # share of the updates after which the learning rate falls linearly to 0; 1: never
 AVERAGED = 0.002         # rate of the average over the actor's weights that is measured and kept; 1: the actor itself
 DISCOUNT = 0.97          # gamma of Eq. 1 (the paper: 0.99)
 SMOOTHING = 0.01         # of the target value network, App. A.1.3
@@ -259,7 +259,7 @@ class Sectar:
 
     def reward(self, displacement, t, z, floor):
         """displacement (K, T, 2) of whole trajectories, t (n, K): the steps of each that are asked for, z (K, AXES) -> (n K,), and
-        what the policy is told at t and after it (n K, 2)."""
+        what the policy is told at t and after it (n K, 2). No floor: a place, unlike a step, does not tremble."""
         x, explorer, i, told = displacement / STEP_SCALE, z[:, -1] == EXPLORER, torch.arange(len(z)), z
         if explorer.any():
             z = z.clone()
@@ -469,7 +469,7 @@ def draw_skills(actor, decoder, weight, name, columns):
                 ax.set_aspect("equal")
         axes[0, column].set(title=f"{title}, $H_z$ = {hold}, T = {steps}")
         if len(values) != len(columns[-1][2]):  # not the latents that the legend of the figure names
-            axes[0, column].legend(title="latent", fontsize=7, loc="upper left")
+            axes[0, column].legend(title="latent", fontsize=7, loc="upper left", ncols=3, handlelength=1)
         axes[1, column].set(xlabel="x (m)")
     for row, text in enumerate(("predicted by the model", "executed by the robot")):
         axes[row, 0].set_ylabel(text + "\n" + (axes[row, 0].get_ylabel() or "y (m)"))
@@ -666,7 +666,7 @@ def train(method, config):
         # Improve: a few updates. What needs no gradient is computed for all of them at once
         floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** min(1, max(0, (progress - 0.15) / 0.45))
         for group in optimizer.param_groups:
-            group["lr"] = LEARNING_RATE * min(1, max(0, (1 - progress) / (1 - DECAY_FROM)))
+            group["lr"] = LEARNING_RATE * min(1, (1 - progress) / max(1 - DECAY_FROM, 1e-9))
         s, a, _, displacement, skill = replay[trajectories(MODEL_BATCH, span, env_steps, replay, RECENT)].split(columns, 2)
         model_loss = method.loss(s, a, displacement, skill, actor)
         share = min(span, 2 * UPDATES_PER_STEP)  # steps of a trajectory in the batch, two in each update: decoded and relabelled once
