@@ -495,8 +495,8 @@ def draw_learning_curve():
                 ax.plot(column["minutes"], column[name], "-", lw=1.2, color=colour, label=name.removeprefix("speed_") if n == 0 else None)
     for ax, label in zip(axes, (f"tracking error ({len(grid())} skills)", "achieved / commanded speed", f"{METHODS[METHOD].metric}, recent steps")):
         ax.set(xlabel=f"minutes of training ({THREADS} thread{'s' * (THREADS > 1)}), {len(curves)} seed{'s' * (len(curves) > 1)}", ylabel=label)
-    axes[0].set(ylim=(0, 1.1))
-    axes[1].set(ylim=(-0.1, 1.3))
+    for ax, (low, high, least, most) in zip(axes, ((0, 1.1, 0, 3), (-0.1, 1.3, -1, 3))):  # a baseline's first skills can be far off
+        ax.set_ylim(max(least, min(low, ax.get_ylim()[0])), min(most, max(high, ax.get_ylim()[1])))
     axes[1].axhline(1, color="black", lw=0.8, ls="--")
     axes[1].legend()
     save_figure(figure, OUT, f"learning_curve_{EXPERIMENT}")

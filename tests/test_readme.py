@@ -121,6 +121,15 @@ def test_every_function_named_beside_the_paper_exists():
                 assert re.search(rf"^(def|class) {name}\b|^{name} =", source, re.M), f"{name} in {path}"
 
 
+def test_learning_curves_end_where_their_policies_are():
+    rows = {(r["experiment"], r["seed"]): r for r in common.read_csv(ROOT / "results/policies.csv")}
+    paths = list((ROOT / "results").glob("learning_curve_*.csv"))
+    assert len(paths) >= 3
+    for path in paths:
+        row = rows[tuple(path.stem.removeprefix("learning_curve_").split("_seed"))]
+        assert float(common.read_csv(path)[-1]["tracking_error"]) == pytest.approx(float(row["tracking_error_as_trained"]), rel=1e-4)
+
+
 def test_pretrained_policy_still_tracks_as_its_row_says(s3, tmp_path):
     """The committed weights, run again, give the committed number (contacts make single roll-outs chaotic across machines)."""
     policy = common.load(tmp_path, "policy", "ant_semi", 0)
