@@ -80,7 +80,7 @@ VAE_SCALE = 0.01         # of SeCTAR's loss beside SAC's; Adam does not notice, 
 CALIBRATED = 16          # starts at each speed from which told speeds are calibrated; 0: not (the paper)
 SPEEDS = 33              # speeds of that calibration, z_speed from -2 to 2
 TRAVERSAL = 13           # skills on each axis at which executed purity and the relation function are measured
-STARTS = 16              # noisy starts over which an executed skill is averaged for its purity
+STARTS = 32              # noisy starts over which an executed skill is averaged for its purity: fewer, and their noise counts as cross-talk
 COVERAGE = 200           # random skills whose visited cells of 1 m are counted at the end
 
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
@@ -463,9 +463,10 @@ def draw_skills(actor, decoder, weight, name, columns):
                 axes[0, column].plot(*predicted[i].T, "o-", ms=3 if hold > 1 else 1, color=colour, label=f"{value:g}")
                 axes[1, column].plot(*executed[i].T, color=colour)
                 axes[1, column].plot(*executed[i, ::hold].T, "o", ms=3 if hold > 1 else 1, color=colour)
-            low, high = both.min((0, 1)) - 1, both.max((0, 1)) + 1
+            low, high = both.min((0, 1)), both.max((0, 1))
+            room = (high - low).max() / 8
             for ax in axes[:, column]:  # one scale for both rows, or the eye is fooled
-                ax.set(xlim=(low[0], high[0]), ylim=(min(-3, low[1]), max(3, high[1])))
+                ax.set(xlim=(low[0] - room, high[0] + room), ylim=(min(-3 * room, low[1] - room), max(3 * room, high[1] + room)))
                 ax.set_aspect("equal")
         axes[0, column].set(title=f"{title}, $H_z$ = {hold}, T = {steps}")
         if len(values) != len(columns[-1][2]):  # not the latents that the legend of the figure names
