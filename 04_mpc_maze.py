@@ -116,19 +116,22 @@ def maze_spec(walls, goal=GOAL):
     return spec
 
 
-def collides(path, walls, radius):
+def collides(path, walls, radius, chunk=20):
     """Which transitions of the paths (N, K + 1, 2) cross a wall grown by radius: (N, K) bool. Exact for segments and rectangles, by
-    separating axes: they are apart if they are along x, along y or across the segment. The last is rarely asked for."""
-    x, y = path.unbind(2)
-    reach_x, reach_y = (x.diff(dim=1) / 2), (y.diff(dim=1) / 2)
-    x, y = x[:, :-1] + reach_x, y[:, :-1] + reach_y  # middles of the transitions
-    far_x, far_y, hit = reach_x.abs() + radius, reach_y.abs() + radius, torch.zeros_like(x, dtype=torch.bool)
+    separating axes: they are apart if they are along x, along y or across the segment. Chunks far from a wall are left out first."""
+    K = path.shape[1] - 1
+    path = torch.cat([path, path[:, -1:].expand(-1, -K % chunk, -1)], 1)
+    x, y = (v.unfold(1, chunk + 1, chunk).flatten(0, 1) for v in path.movedim(2, 0).contiguous())  # a row per chunk, ends shared
+    low_x, high_x, low_y, high_y = x.amin(1), x.amax(1), y.amin(1), y.amax(1)
+    hit = torch.zeros(len(x), chunk, dtype=torch.bool)
     for x0, x1, y0, y1 in walls:
-        near = ((x - (x0 + x1) / 2).abs() <= far_x + (x1 - x0) / 2) & ((y - (y0 + y1) / 2).abs() <= far_y + (y1 - y0) / 2)
-        i = near.nonzero(as_tuple=True)
-        across = (reach_x[i] * (y[i] - (y0 + y1) / 2) - reach_y[i] * (x[i] - (x0 + x1) / 2)).abs()
-        hit[i] |= across <= reach_x[i].abs() * ((y1 - y0) / 2 + radius) + reach_y[i].abs() * ((x1 - x0) / 2 + radius)
-    return hit
+        i = ((low_x <= x1 + radius) & (high_x >= x0 - radius) & (low_y <= y1 + radius) & (high_y >= y0 - radius)).nonzero().squeeze(1)
+        reach_x, reach_y, half_x, half_y = x[i].diff() / 2, y[i].diff() / 2, (x1 - x0) / 2 + radius, (y1 - y0) / 2 + radius
+        mid_x, mid_y = x[i, :-1] + reach_x - (x0 + x1) / 2, y[i, :-1] + reach_y - (y0 + y1) / 2  # of transitions, from the wall's middle
+        far_x, far_y = reach_x.abs(), reach_y.abs()
+        hit[i] |= ((mid_x.abs() <= far_x + half_x) & (mid_y.abs() <= far_y + half_y)
+                   & ((reach_x * mid_y - reach_y * mid_x).abs() <= far_x * half_y + far_y * half_x))
+    return hit.view(len(path), -1)[:, :K]
 
 
 # ---------------------------------------------------------------- skills
@@ -197,7 +200,7 @@ def scaled_path(start, delta):
 def score(path, walls, goal, sparse, objective):
     """Planning reward r_d or r_s of paths (N, K + 1, 2), Sec. 6.2: (N,)."""
     goal = torch.tensor(goal)
-    distance = (path[:, 1:] - goal).norm(dim=2)
+    distance = (path[:, 1 if objective == "sum" or STOP_AT_GOAL else -1:] - goal).norm(dim=2)  # nobody asks for the others
     cost = PENALTY * collides(path, walls, RADIUS)
     if MARGIN:
         cost = cost + MARGIN_PENALTY * collides(path, walls, RADIUS + MARGIN)

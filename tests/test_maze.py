@@ -30,13 +30,13 @@ def test_distances_are_the_papers(s4):
     assert sum(np.subtract(s4.GOAL, s4.START)) == 36  # A.1.4: the effective distance
 
 
-@pytest.mark.parametrize("maze, scale", [("maze1", 30), ("s_maze", 30), ("obstacles", 0.3)])
-def test_collisions_agree_with_dense_sampling(s4, maze, scale):
+@pytest.mark.parametrize("maze, scale, n, length", [("maze1", 30, 500, 2), ("s_maze", 30, 500, 2), ("obstacles", 0.3, 500, 2), ("maze2", 2, 50, 45)])
+def test_collisions_agree_with_dense_sampling(s4, maze, scale, n, length):
     rng = np.random.default_rng(0)
-    path = rng.uniform([-8, -8], [33, 20], (500, 1, 2)) + np.pad(np.cumsum(rng.uniform(-scale, scale, (500, 2, 2)), 1), ((0, 0), (1, 0), (0, 0)))
+    path = rng.uniform([-8, -8], [33, 20], (n, 1, 2)) + np.pad(np.cumsum(rng.uniform(-scale, scale, (n, length, 2)), 1), ((0, 0), (1, 0), (0, 0)))
     found = s4.collides(torch.from_numpy(path.astype(np.float32)), s4.MAZE[maze], 1.0).numpy()
     points = path[:, :-1, None] + np.linspace(0, 1, 1501)[:, None] * np.diff(path, axis=1)[:, :, None]
-    hit = np.zeros((500, 2), bool)
+    hit = np.zeros((n, length), bool)
     for x0, x1, y0, y1 in s4.MAZE[maze]:
         hit |= ((points >= (x0 - 1, y0 - 1)) & (points <= (x1 + 1, y1 + 1))).all(3).any(2)
     assert (hit != found).sum() <= 2 and 0.05 < found.mean() < 0.95  # sampling misses a corner cut shorter than its step
