@@ -53,7 +53,8 @@ def tables():
     policies = ["| policy | seed | updates | minutes | tracking error, mean actions | before calibration | sampled | direction error "
                 "| speed ratio slow / middle / fast | flips "
                 "| executed purity speed / direction / curvature / acceleration | coverage (cells) |", "|---" * 12 + "|"]
-    for r in results["policies"]:
+    order = list(script("03_train_policy").EXPERIMENTS).index
+    for r in sorted(results["policies"], key=lambda r: (order(r["experiment"]), r["seed"])):
         ratios = " / ".join(num(r["speed_ratio_" + speed], ".2f") for speed in ("slow", "mid", "fast"))
         purity = " / ".join(num(r[k], ".2f") if r[k] else "–" for k in r if k.startswith("purity_"))
         policies.append(f"| {r['experiment']} | {r['seed']} | {r['updates']} | {num(r['train_minutes'], '.0f')} | "
@@ -61,7 +62,7 @@ def tables():
                         f"{num(r['tracking_error_sampled'], '.3f')} | {num(r['direction_error_deg'], '.1f')}° | "
                         f"{ratios} | {r['flips']} | {purity} | {r['coverage_cells']} |")
     baselines = ["| method | seed | measure | value |", "|---|---|---|---|"] + [
-        f"| {r['method']} | {r['seed']} | {r['what'].replace('_', ' ')} | {num(r['value'], '.3f')} |" for r in results["baselines"]]
+        f"| {r['method']} | {r['seed']} | {r['what'].replace('_', ' ')} | {num(r['value'], '.3f')} |" for r in sorted(results["baselines"], key=lambda r: (r["method"], r["seed"]))]
     stage = script("04_mpc_maze")
     key = lambda r: (r["maze"], r["objective"], r["reward"], r["prediction"], r["seed"])  # noqa: E731
     results["sum"] = [r for r in results["mazes"] if r["objective"] == "sum"]
