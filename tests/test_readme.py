@@ -62,7 +62,8 @@ def tables():
                         f"{num(r['tracking_error_sampled'], '.3f')} | {num(r['direction_error_deg'], '.1f')}° | "
                         f"{ratios} | {r['flips']} | {purity} | {r['coverage_cells']} |")
     baselines = ["| method | seed | measure | value |", "|---|---|---|---|"] + [
-        f"| {r['method']} | {r['seed']} | {r['what'].replace('_', ' ')} | {num(r['value'], '.3f')} |" for r in sorted(results["baselines"], key=lambda r: (r["method"], r["seed"]))]
+        f"| {r['method']} | {r['seed']} | {r['what'].replace('_', ' ')} | {num(r['value'], '.3f')} |"
+        for r in sorted(results["baselines"], key=lambda r: (r["method"], r["seed"]))]
     stage = script("04_mpc_maze")
     key = lambda r: (r["maze"], r["objective"], r["reward"], r["prediction"], r["seed"])  # noqa: E731
     results["sum"] = [r for r in results["mazes"] if r["objective"] == "sum"]
