@@ -300,13 +300,13 @@ def run(skills, cases):
                      look_ahead=ahead[c] * skills.hold * skills.length, samples=case.samples, trial=i - c * TRIALS, seed=SEED,
                      final_distance=distance[i, -1], min_distance=distance[i].min(), success=int(distance[i, -1] < EPSILON),
                      contacts=contacts[i], path_length=length[i], planning_ms=1e3 * planning[mine].sum() / sum(map(len, plans[mine])),
-                     options=case.options, policy=skills.sha) for i in range(n)[mine]]
+                     options=case.options, policy_seed=POLICY_SEED, policy=skills.sha) for i in range(n)[mine]]
         yield case, rows, poses[mine], plans[mine]
 
 
 # ---------------------------------------------------------------- tables
 
-KEY = ("maze", "reward", "method", "prediction", "objective", "look_ahead", "samples", "options", "seed", "trial")
+KEY = ("maze", "reward", "method", "prediction", "objective", "look_ahead", "samples", "options", "policy_seed", "seed", "trial")
 HEADER = ("| maze | reward | prediction | objective | mean final distance (m) | 95 % interval | median | success (< 5 m) | wall steps | trials |\n"
           "|---|---|---|---|---|---|---|---|---|---|")
 

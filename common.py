@@ -37,7 +37,7 @@ matplotlib.use("Agg")  # figures are files; no window is ever opened
 import matplotlib.pyplot as plt  # noqa: E402
 
 HERE = Path(__file__).parent
-FORMAT = 1  # artifact format; raise it when what is stored changes meaning
+FORMAT = 2  # artifact format; raise it when what is stored changes meaning
 SCRIPT = {"dataset": "01_make_dataset.py", "wetvae": "02_train_wetvae.py", "policy": "03_train_policy.py"}
 
 
@@ -486,6 +486,7 @@ class Robots:
 
 # ---------------------------------------------------------------- the skill policy
 
+FASTEST = 0.85  # trajectory units: the longest step that a calibrated policy is told, a skill's of z_speed = 2
 EXPLORER = 3.0  # the last entry of the z that means "explore" to SeCTAR's policy: far from N(0, I), and no plan asks for it
 ANKLES = torch.tensor([1.0, -1.0, -1.0, 1.0])  # legs 1 2 3 4: which way a bent ankle counts
 
@@ -531,7 +532,7 @@ class Actor(nn.Module):
                                  nn.Linear(hidden, 2 * a_dim))
         self.register_buffer("s_mean", torch.zeros(s_dim))
         self.register_buffer("s_std", torch.ones(s_dim))
-        self.register_buffer("told", torch.zeros(2, 0))  # speeds calibrated by 03: z_speed, evenly spaced, and what to say for it
+        self.register_buffer("told", torch.zeros(0, 0, 2))  # calibrated by 03: by speed and angle of a wanted step, what to add to it
 
     def inputs(self, s, z, step=None):
         """s (B, n), z (B, m), step (B, 2): what z asks for, if it is known -> what the networks see (B, s_dim + z_dim) and by how
@@ -562,13 +563,36 @@ class Actor(nn.Module):
     @torch.no_grad()
     def act(self, s, z, deterministic=False, t=0):
         """The action (B, a_dim) for the robot's own motors."""
-        if self.told.numel():  # an asked speed -> the one to tell the policy, which would be late otherwise
-            asked, tell = self.told
-            at = ((z[:, 0] - asked[0]) / (asked[1] - asked[0])).clamp(0, len(asked) - 1.001)
-            z = torch.cat([torch.lerp(tell[at.long()], tell[at.long() + 1], at.frac())[:, None], z[:, 1:]], 1)
-        x, turns = self.inputs(s, z, self.wanted(z, t))
+        return self.follow(s, self.wanted(z, t), deterministic)
+
+    @torch.no_grad()
+    def follow(self, s, step, deterministic=False):
+        """As act, asked for a step (B, 2) instead of a skill."""
+        step = self.tell(s, step)
+        x, turns = self.inputs(s, step, step)
         action, _ = self(x, deterministic)
         return self.seen(action, -turns)
+
+    def tell(self, s, step):
+        """What to tell the policy for a step (B, 2) to be made: itself, unless 03 has calibrated that."""
+        if not len(self.told):
+            return step
+        nodes, share = self.nodes(s, step)
+        more = torch.view_as_complex((self.told.flatten(0, 1)[nodes] * share[..., None]).sum(1))  # ahead, and to the left of the step
+        step = torch.view_as_complex(step)
+        step = step + more * torch.polar(torch.ones(len(s)), step.angle())
+        return torch.view_as_real(step / (step.abs() / FASTEST).clamp(min=1))
+
+    def nodes(self, s, step):
+        """Between which four entries of told, flattened, a step (B, 2) lies, (B, 4), and their shares (B, 4): rows are speeds from 0 to
+        FASTEST, columns angles from the torso's heading, round a quarter turn, after which the Ant looks the same."""
+        rows, columns = self.told.shape[:2]
+        angle = torch.view_as_complex(step).angle() - 2 * torch.complex(s[:, 1], s[:, 4]).angle()  # see egocentric
+        row = (step.norm(dim=1) * (rows - 1) / FASTEST).clamp(max=rows - 1.001)
+        column = angle * 4 / (2 * math.pi) % 1 * columns
+        i, j, down, right = row.long(), column.long(), row.frac(), column.frac()
+        nodes = [k * columns + m % columns for k in (i, i + 1) for m in (j, j + 1)]
+        return torch.stack(nodes, 1), torch.stack([u * v for u in (1 - down, down) for v in (1 - right, right)], 1)
 
     def seen(self, action, turns):
         """Actions with legs counted on by quarter turns: of the motors -> of the networks; with -turns back again."""
