@@ -4,8 +4,9 @@ and 7, DADS and SeCTAR, by the same loop: a method is where skills come from, wh
 Reads runs/wetvae_*.pt. The reward is the decoder's log-likelihood of the step just made (Eq. 6), computed when a batch is
 sampled, so that any stored step can be relabelled with a fresh skill. Writes runs/policy_<experiment>_seed<seed>.pt,
 Fig 5 (15, 16), the learning curve (figures/, results/) and a row of results/policies.csv.
-Takes 55 minutes on one core (49 updates/s; AMD EPYC 7003, no AVX-512), TWO with --threads 2. Expect, n = 3 (seeds 0, 1, 2): tracking error 0.13, 0.12,
-0.11 with mean actions (0.16, 0.12, 0.22 before calibration), direction error 4, 3, 3 degrees, speeds at 0.92 to 1.11 of those asked, no flips.
+Takes 55 minutes on one core (49 updates/s; AMD EPYC 7003, no AVX-512), 41 on two with --threads 2. Expect, n = 3 (seeds 0, 1, 2): tracking
+error 0.13, 0.12, 0.11 with mean actions (0.16, 0.12, 0.22 before calibration), direction error 4, 3, 3 degrees, speeds at 0.92 to 1.11 of
+those asked, no flips.
 """
 import copy
 import math
@@ -438,10 +439,11 @@ def calibrate_steps(actor):
         missed, visits = torch.zeros_like(told), torch.zeros(len(told))
         for t in range(EPISODE):
             s = robots.observe()
-            displacement, _ = robots.step(actor.follow(s, torch.view_as_real(step), True).numpy())
+            displacement, failed = robots.step(actor.follow(s, torch.view_as_real(step), True).numpy())
             if t >= EPISODE // 5:
                 miss = torch.view_as_real((step - torch.view_as_complex(displacement) / STEP_SCALE) * torch.polar(torch.ones(len(s)), -step.angle()))
                 nodes, share = actor.nodes(s, torch.view_as_real(step))
+                share[failed] = 0  # an unstable step means nothing
                 missed.index_add_(0, nodes.flatten(), (share[..., None] * miss[:, None]).flatten(0, 1))
                 visits.index_add_(0, nodes.flatten(), share.flatten())
         told = told + missed / (visits + 50)[:, None] / k ** 0.7  # 50: what is seldom met hardly changes
@@ -746,6 +748,7 @@ if __name__ == "__main__":
                  + more * (method.span > 1))
         trained = take(decoder) if TAKEN else train(method, config)
         if CALIBRATED and METHOD == "wedis" and EGOCENTRIC and not TAKEN:
+            torch.manual_seed(SEED)  # the same numbers however long was trained
             trained["actor"]["told"] = calibrate_steps(load_actor(trained))
         kept = {name: trained[name] for name in ("actor", "decoder", "encoder", "curve", "updates", "env_steps", "seconds") if name in trained}
         save(OUT, "policy", EXPERIMENT, SEED, config, relation_weight=weight, **kept)

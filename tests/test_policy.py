@@ -251,7 +251,7 @@ def test_steps_of_a_policy_that_misses_are_calibrated(s3, monkeypatch):
             seen = 4 * (np.angle(told) - self.heading)
             walked = s3.STEP_SCALE * told * (0.75 + 0.15 * np.cos(seen)) * np.exp(0.3j * np.sin(seen))
             self.heading += 0.05
-            return torch.from_numpy(np.stack([walked.real, walked.imag], 1)).float(), None
+            return torch.from_numpy(np.stack([walked.real, walked.imag], 1)).float(), np.zeros(len(told), bool)
 
     actor = common.Actor(26, 2, 8, 8, common.Decoder(3))
     for name, value in dict(make_robots=World, CALIBRATED=6, CALIBRATORS=1000, EPISODE=40).items():
