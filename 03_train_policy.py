@@ -82,6 +82,8 @@ CALIBRATED = 4           # rounds of calibrating the steps that an egocentric po
 CALIBRATORS = 384        # robots that walk an episode in each
 SPEEDS = 16              # of a wanted step,
 ANGLES = 9               # and its angles from the torso's heading, at which it is corrected
+SELDOM = 50.0            # visits without a miss that every correction begins a round with: what is seldom met hardly changes
+GAIN_DECAY = 0.7         # the k-th round's misses count k ** -GAIN_DECAY: noise averages out
 TRAVERSAL = 13           # skills on each axis at which executed purity and the relation function are measured
 STARTS = 32              # noisy starts over which an executed skill is averaged for its purity: fewer, and their noise counts as cross-talk
 COVERAGE = 200           # random skills whose visited cells of 1 m are counted at the end
@@ -91,7 +93,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
     "ant_full": dict(DECODER="full_circle", DIRECTIONS=16, TAKEN="ant_semi"),                                          # Fig 15
     "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, EGOCENTRIC=False, AXES=2,                 # Fig 16
                          UPDATES=100_000),
-    # the baselines train by the clock, as long as WEDIS takes
+    # the baselines train by the clock
     "ant_dads": dict(METHOD="dads", AXES=2, Z_RANGE=1.0, SKILL_STEPS=200, RECENT=10_000, MODEL_BATCH=256, MINUTES=45.0),
     "ant_sectar": (SECTAR := dict(METHOD="sectar", AXES=8, LENGTH=50, HOLD=1, PROFILE=10, SKILL_STEPS=50, RECENT=128_000,
                                   MODEL_BATCH=128, REWARD_SCALE=0.3, MINUTES=45.0)),
@@ -426,7 +428,7 @@ def calibrate_relation(decoder, steps=5):
 
 @torch.no_grad()
 def calibrate_steps(actor):
-    """Beyond the paper: fills actor.told (SPEEDS, ANGLES, 2), so that the Ant makes on average the steps it is asked for.
+    """Beyond the paper: the table (SPEEDS, ANGLES, 2) for actor.told with which the Ant makes on average the steps it is asked for.
 
     What it misses, ahead and to the left of the step, by the step's speed and its angle from the torso, is added to what it is told, and
     measured again, a little less each time (stochastic approximation). Episodes begin with noise; their first fifth is not counted."""
@@ -436,17 +438,18 @@ def calibrate_steps(actor):
         robots = make_robots(CALIBRATORS)
         robots.reset(np.arange(CALIBRATORS), rng)
         step = torch.polar(FASTEST * (torch.arange(CALIBRATORS) + 0.5) / CALIBRATORS, 2 * math.pi * torch.rand(CALIBRATORS))
-        missed, visits = torch.zeros_like(told), torch.zeros(len(told))
+        asked, back = torch.view_as_real(step), torch.polar(torch.ones(CALIBRATORS), -step.angle())  # back: turns the step ahead
+        missed, visits = torch.zeros_like(told), torch.full((len(told),), SELDOM)
         for t in range(EPISODE):
             s = robots.observe()
-            displacement, failed = robots.step(actor.follow(s, torch.view_as_real(step), True).numpy())
+            displacement, failed = robots.step(actor.follow(s, asked, True).numpy())
             if t >= EPISODE // 5:
-                miss = torch.view_as_real((step - torch.view_as_complex(displacement) / STEP_SCALE) * torch.polar(torch.ones(len(s)), -step.angle()))
-                nodes, share = actor.nodes(s, torch.view_as_real(step))
+                miss = torch.view_as_real((step - torch.view_as_complex(displacement) / STEP_SCALE) * back)
+                nodes, share = actor.nodes(s, asked)
                 share[failed] = 0  # an unstable step means nothing
                 missed.index_add_(0, nodes.flatten(), (share[..., None] * miss[:, None]).flatten(0, 1))
                 visits.index_add_(0, nodes.flatten(), share.flatten())
-        told = told + missed / (visits + 50)[:, None] / k ** 0.7  # 50: what is seldom met hardly changes
+        told = told + missed / visits[:, None] / k ** GAIN_DECAY
     return told.view(SPEEDS, ANGLES, 2)
 
 

@@ -2,7 +2,7 @@
 
 Reads runs/policy_*.pt (or those in pretrained/). Plans over skills, executes on the MuJoCo Ant between walls of real geoms.
   main      the table of WEDIS, Fig 3, 6, 8, 17 and a GIF per maze, results/mazes.csv: 2 minutes on two cores (AMD EPYC 7003)
-  figure7   all methods and sample sizes, Fig 7, Table 2, the paper's claims tested, results/figure7.csv: 22 minutes on two cores, resumes
+  figure7   all methods and sample sizes, Fig 7, Table 2, the paper's claims tested, results/figure7.csv: 24 minutes on two cores, resumes
   matched   every method looks equally far ahead          fig18     S-maze and obstacles, Fig 18
   best      the best of the options below                 each writes results/<experiment>.csv
 """

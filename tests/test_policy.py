@@ -222,6 +222,7 @@ def test_a_policy_that_is_taken_over_walks_the_steps_of_the_other_decoder(s3, mo
     robots.reset(np.arange(20), np.random.default_rng(0))
     s = robots.observe()
     x, turns = own.inputs(s, z, common.predict(decoder, nn.functional.pad(z, (0, 1)), 1)[:, 0])
+    assert len(own.told) and torch.equal(taken.told, own.told)  # calibrated by steps, so it holds for any decoder's
     taken.told = torch.zeros(0, 0, 2)
     torch.testing.assert_close(taken.act(s, z, True), own.seen(own(x, True)[0], -turns))
     content = common.load(tmp_path, "policy", "ant_semi", 0)
