@@ -82,7 +82,7 @@ CALIBRATED = 4           # rounds of calibrating the steps that an egocentric po
 CALIBRATORS = 384        # robots that walk an episode in each
 SPEEDS = 16              # of a wanted step,
 ANGLES = 9               # and its angles from the torso's heading, at which it is corrected
-SELDOM = 50.0            # visits without a miss that every correction begins a round with: what is seldom met hardly changes
+SELDOM = 50.0            # added to the visits that a correction has in a round: what is seldom met hardly changes
 GAIN_DECAY = 0.7         # the k-th round's misses count k ** -GAIN_DECAY: noise averages out
 TRAVERSAL = 13           # skills on each axis at which executed purity and the relation function are measured
 STARTS = 32              # noisy starts over which an executed skill is averaged for its purity: fewer, and their noise counts as cross-talk
@@ -439,7 +439,7 @@ def calibrate_steps(actor):
         robots.reset(np.arange(CALIBRATORS), rng)
         step = torch.polar(FASTEST * (torch.arange(CALIBRATORS) + 0.5) / CALIBRATORS, 2 * math.pi * torch.rand(CALIBRATORS))
         asked, back = torch.view_as_real(step), torch.polar(torch.ones(CALIBRATORS), -step.angle())  # back: turns the step ahead
-        missed, visits = torch.zeros_like(told), torch.full((len(told),), SELDOM)
+        missed, visits = torch.zeros_like(told), torch.zeros(len(told))
         for t in range(EPISODE):
             s = robots.observe()
             displacement, failed = robots.step(actor.follow(s, asked, True).numpy())
@@ -449,7 +449,7 @@ def calibrate_steps(actor):
                 share[failed] = 0  # an unstable step means nothing
                 missed.index_add_(0, nodes.flatten(), (share[..., None] * miss[:, None]).flatten(0, 1))
                 visits.index_add_(0, nodes.flatten(), share.flatten())
-        told = told + missed / visits[:, None] / k ** GAIN_DECAY
+        told = told + missed / (visits + SELDOM)[:, None] / k ** GAIN_DECAY
     return told.view(SPEEDS, ANGLES, 2)
 
 
