@@ -1,23 +1,21 @@
-"""Stage 3: decoder -> skill policy pi(a | s, z_single), trained by SAC on single steps (Sec. 4.2, App. A.1.3); and the baselines of Fig 5
-and 7, DADS and SeCTAR, by the same loop: a method is where skills come from, what a transition is worth, and what else learns.
+"""Stage 3: decoder -> skill policy pi(a | s, c), trained by SAC on single steps (Sec. 4.2, Algorithm 1, App. A.1.3).
 
-Reads runs/wetvae_*.pt. The reward is the decoder's log-likelihood of the step just made (Eq. 6), computed when a batch is
-sampled, so that any stored step can be relabelled with a fresh skill. Writes runs/policy_<experiment>_seed<seed>.pt,
-Fig 5 (15, 16), the learning curve (figures/, results/) and a row of results/policies.csv.
-Takes 55 minutes on one core (49 updates/s; AMD EPYC 7003, no AVX-512), 41 on two with --threads 2. Expect, n = 3 (seeds 0, 1, 2): tracking
-error 0.13, 0.12, 0.11 with mean actions (0.16, 0.12, 0.22 before calibration), direction error 4, 3, 3 degrees, speeds at 0.92 to 1.11 of
-those asked, no flips.
+Reads runs/wetvae_*.pt of stage 2. A skill z_single asks for a step: the decoder's first displacement, here called the
+command c. The reward is the decoder's log-likelihood of the step that the robot makes (Eq. 6). Writes
+runs/policy_<experiment>_seed<seed>.pt, Fig 5 (15, 16), the learning curve and a row of runs/results/policies.csv.
+MINUTES
 """
 import copy
 import math
 import time
-from itertools import combinations, permutations
+from concurrent.futures import ThreadPoolExecutor
+from itertools import permutations
 from pathlib import Path
 
 import common  # before mujoco: it chooses how mujoco renders
-from common import (EXPLORER, FASTEST, Actor, Decoder, Robots, SkillDynamics, ant_spec, artifact_name, check_same, cross_talk, egocentric, execute,
-                    factors_of, first_step, load, load_actor, load_decoder, parse_flags, plt, predict, read_csv, resumable, save, save_figure, stop,
-                    update_csv)
+from common import (MULTI, SINGLE, Actor, Decoder, Robots, SkillDynamics, ant_spec, artifact_name, check_same, commands_of,
+                    cross_talk, execute, factors_of, first_step, load, load_policy, pack, parse_flags, plt, purity, read_csv,
+                    save, save_figure, stop, unpack, update_csv)
 import mujoco
 import numpy as np
 import torch
@@ -25,81 +23,777 @@ from torch import nn
 
 EXPERIMENT = "ant_semi"  # row of EXPERIMENTS below
 SEED = 0                 # random seed
-OUT = "."                # folder for runs/, figures/ and results/
+OUT = "runs"             # folder that everything is written to
 TRAIN = True             # false: only measure and draw what is already trained
 RESUME = False           # true: continue from the last checkpoint
-THREADS = 1              # CPU threads; two trainings on one each make half as many updates again as one on two
-UPDATES = 160_000        # SAC updates; the schedules below run over them (the paper: 1.92 million)
-MINUTES = 0.0            # if not 0, the schedules run out with this clock instead, whatever UPDATES says
-CHECKPOINT = 5.0         # minutes between checkpoints, which are made after a report
-REPORTS = 40             # printed lines and points of the learning curve
+THREADS = 2              # CPU threads; 1: the robots wait for the updates, with the same result
+CHECKPOINT = 5.0         # minutes between checkpoints
+REPORTS = 20             # printed lines, and points of the learning curve
 
+METHOD = "wedis"         # wedis, dads or sectar
 DECODER = "main"         # experiment of 02 whose decoder is the reward
 DECODER_SEED = 0         # and its seed
-TAKEN = ""               # experiment whose egocentric policy is taken as it is, told the steps of this decoder ("": train)
-METHOD = "wedis"         # wedis, dads or sectar
 ROBOT = "ant"            # ant or half_cheetah
 STEP_SCALE = 0.1         # metres per trajectory unit, App. A.1.3: 1/10, Half-Cheetah 1/5
-DIRECTIONS = 5           # of the tracking grid: from -1.5 to 1.5 of z_dir
-AXES = 3                 # entries of z: speed, direction, curvature; Half-Cheetah 2, DADS 2, SeCTAR 8
-Z_RANGE = 1.5            # ends of a traversed axis
-HOLD = 100               # H_z of the tracking error
-LENGTH = 1               # T of the tracking error
-PROFILE = 40             # H_z at which executed factors are measured, T = 5
+VARIANCE_SCALE = 0.05    # decoder variance -> square metres, App. A.1.3: 1/20
+BASE_FRAME = True        # networks read state and command in the base frame (the paper: in the world's)
 
-ROBOTS = 64              # environments that step together
+UPDATES = 100_000        # updates of the critics (the paper: 1.92 million)
+ROBOTS = 256             # robots that step together
 EPISODE = 200            # steps until a robot starts anew; not terminal: the value beyond is bootstrapped
-SKILL_STEPS = 100        # steps until a robot is given a new skill
+SKILL_STEPS = 50         # steps until the robots are given new skills
 WARM_UP = 10_000         # steps with random actions; their statistics normalise the state
-REPLAY = 1_000_000       # steps kept
-UPDATES_PER_STEP = 8     # updates after each step of all robots
+REPLAY = 1_000_000       # size of the replay buffer R, steps
+UPDATES_PER_STEP = 8     # updates in each step of all robots
 BATCH = 256              # App. A.1.3
-RELABELLED = 0.5         # share of a batch given a fresh skill from the prior (hindsight)
+RELABELLED = 0.5         # share of a batch that is given a fresh skill (hindsight relabelling; the paper: 0)
 
-EGOCENTRIC = True        # the networks see state and wanted step from the torso, up to quarter turns (false: s and z, the paper)
 HIDDEN = 256             # width of the two hidden layers (the paper: 512)
 LEARNING_RATE = 1e-3     # Adam (the paper: 3e-4, fixed)
-DECAY_FROM = 0.5         # share of the updates after which the learning rate falls linearly to 0; 1: never
-AVERAGED = 0.002         # rate of the average over the actor's weights that is measured and kept; 1: the actor itself
-DISCOUNT = 0.97          # gamma of Eq. 1 (the paper: 0.99)
+DECAY_FROM = 0.5         # share of the updates after which the learning rate falls linearly to 0
+ACTOR_EVERY = 2          # actor and value network learn in each second update of the critics (the paper: 1)
+AVERAGED = 0.002         # rate of the running average of the actor's weights, which is the policy (the paper: 1)
+DISCOUNT_START = 0.95    # gamma of Eq. 1 at the start: a short horizon teaches tracking sooner
+DISCOUNT = 0.985         # and from the middle on: a long one teaches not to fall (the paper: 0.99)
 SMOOTHING = 0.01         # of the target value network, App. A.1.3
-REWARD_SCALE = 0.1       # the paper: 1
+REWARD_SCALE = 0.1       # of Eq. 6 (the paper: 1)
 TEMPERATURE = 0.003      # alpha, weight of the entropy (the paper: 0.01, which is 0.001 at our reward scale)
-VARIANCE_SCALE = 0.05    # decoder variance -> square metres, App. A.1.3: 1/20
 FLOOR_START = 0.04       # metres, least standard deviation of the reward: a sharp one makes standing still a trap
 FLOOR_END = 0.01         # shrinks to this between 0.15 and 0.6 of the updates: teaches the slow skills
 
-RECENT = 0               # latest steps that a baseline's model learns from, once in UPDATES_PER_STEP updates
-MODEL_BATCH = 0          # steps (DADS) or trajectories (SeCTAR) in a batch of theirs
+# Baselines only
+Z_DIM = 2                # entries of z: DADS 2, SeCTAR 8
+RECENT = 40_000          # latest steps that a baseline's model learns from
+MODEL_BATCH = 256        # steps (DADS) or trajectories (SeCTAR) in a batch of theirs
 PRIOR_SAMPLES = 100      # L of DADS's reward
-MOMENTS = 0.02           # rate of the running mean and deviation that normalise DADS's targets
 EXPLORE = 0.5            # SeCTAR: share of trajectories that are the explorer's (0: no explorer)
-KL_WEIGHT = 2.0          # SeCTAR
-CLONING = 0.1            # SeCTAR: weight of behaviour cloning (published: 100; the mean of many lively actions is standing still)
-VAE_SCALE = 0.01         # of SeCTAR's loss beside SAC's; Adam does not notice, but for the actor: cloning against reward
+KL_WEIGHT = 2.0          # SeCTAR: of the KL divergence in its ELBO
 
-CALIBRATED = 4           # rounds of calibrating the steps that an egocentric policy is told; 0: none (the paper)
-CALIBRATORS = 384        # robots that walk an episode in each
-SPEEDS = 16              # of a wanted step,
-ANGLES = 9               # and its angles from the torso's heading, at which it is corrected
-SELDOM = 50.0            # added to the visits that a correction has in a round: what is seldom met hardly changes
-GAIN_DECAY = 0.7         # the k-th round's misses count k ** -GAIN_DECAY: noise averages out
-TRAVERSAL = 13           # skills on each axis at which executed purity and the relation function are measured
-STARTS = 32              # noisy starts over which an executed skill is averaged for its purity: fewer, and their noise counts as cross-talk
-COVERAGE = 200           # random skills whose visited cells of 1 m are counted at the end
+# Measuring only: never an obstacle to --resume
+DIRECTIONS = 5           # of the tracking grid, from -Z_RANGE to Z_RANGE of z_dir
+Z_RANGE = 1.5            # ends of a traversed axis
+SINGLE_RUN = (1, 100)    # T and H_z of the tracking error, and of Fig 5 for axes of z_single, Sec. 6.1.2
+MULTI_RUN = (5, 40)      # T and H_z of the following error and of purity, and of Fig 5 for axes of z_multi
+TRAVERSAL = 13           # skills on each axis at which purity is measured
+NOISY = 16               # noisy starts over which an executed skill is averaged for its purity
+STARTS = 400             # noisy starts of the following error
+FIGURE = ""              # name of the figure of skills ("": skills_<experiment>)
 
+SECTAR = dict(METHOD="sectar", Z_DIM=8, RECENT=512_000, MODEL_BATCH=128, REWARD_SCALE=0.3, SINGLE_RUN=(50, 1),
+              MULTI_RUN=(50, 1))
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
-    "ant_semi": {},
-    "ant_full": dict(DECODER="full_circle", DIRECTIONS=16, TAKEN="ant_semi"),                                          # Fig 15
-    "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, EGOCENTRIC=False, AXES=2,                 # Fig 16
-                         UPDATES=100_000),
-    # the baselines train by the clock
-    "ant_dads": dict(METHOD="dads", AXES=2, Z_RANGE=1.0, SKILL_STEPS=200, RECENT=10_000, MODEL_BATCH=256, MINUTES=45.0),
-    "ant_sectar": (SECTAR := dict(METHOD="sectar", AXES=8, LENGTH=50, HOLD=1, PROFILE=10, SKILL_STEPS=50, RECENT=128_000,
-                                  MODEL_BATCH=128, REWARD_SCALE=0.3, MINUTES=45.0)),
+    "ant_semi": dict(FIGURE="fig05_skills_wedis"),
+    "ant_full": dict(DECODER="full_circle", DIRECTIONS=16, FIGURE="fig15_full_circle"),
+    "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, BASE_FRAME=False, Z_RANGE=1.0, UPDATES=60_000,
+                         MULTI_RUN=(6, 20), FIGURE="fig16_half_cheetah"),
+    "ant_world_frame": dict(BASE_FRAME=False),  # the paper's networks: what the base frame is good for
+    "ant_dads": dict(METHOD="dads", Z_RANGE=1.0, SKILL_STEPS=200, FIGURE="fig05_skills_dads"),
+    "ant_sectar": SECTAR | dict(FIGURE="fig05_skills_sectar"),
     "ant_sectar_no_explorer": SECTAR | dict(EXPLORE=0.0),  # what the explorer is good for
 }
-FACTORS = dict(speed=1.0, direction=2 * math.pi, curvature=math.pi / 3)  # of which the baselines' axes know nothing: full ranges, Table 1
+MAY_DIFFER = ("OUT TRAIN RESUME THREADS CHECKPOINT REPORTS UPDATES DIRECTIONS Z_RANGE SINGLE_RUN MULTI_RUN TRAVERSAL NOISY "
+              "STARTS FIGURE").split()  # from a checkpoint's
+
+
+# ---------------------------------------------------------------- SAC (Haarnoja et al. 2017), App. A.1.3
+
+class Critics(nn.Module):
+    """Q_1 and Q_2 as one stack of batched matrix products (one call instead of two). (B, n), (B, m) -> (2, B)."""
+
+    def __init__(self, n_in):
+        super().__init__()
+        sizes = [n_in, HIDDEN, HIDDEN, 1]
+        layers = [[nn.Linear(a, b) for a, b in zip(sizes, sizes[1:])] for _ in range(2)]  # torch's own initialisation
+        self.weights = nn.ParameterList(torch.stack([one.weight.T, two.weight.T]).detach() for one, two in zip(*layers))
+        self.biases = nn.ParameterList(torch.stack([one.bias, two.bias])[:, None].detach() for one, two in zip(*layers))
+
+    def forward(self, x, a):
+        h = torch.cat([x, a], 1).expand(2, -1, -1)
+        h = torch.relu(torch.baddbmm(self.biases[0], h, self.weights[0]))
+        h = torch.relu(torch.baddbmm(self.biases[1], h, self.weights[1]))
+        return (h * self.weights[2].mT).sum(2) + self.biases[2].squeeze(2)  # a product with one column is faster as a sum
+
+
+def value_network(n_in):
+    return nn.Sequential(nn.Linear(n_in, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 1))
+
+
+class Sac:
+    """Actor psi, twin critics, value network and its target network, with a fixed temperature; average: the policy that is
+    kept, a running average of the actor's weights (single ones swing from report to report)."""
+
+    def __init__(self, s_dim, c_dim, a_dim):
+        self.actor = Actor(s_dim, c_dim, a_dim, HIDDEN, BASE_FRAME)
+        n_in = self.actor.net[0].in_features
+        self.critics, self.value = Critics(n_in + a_dim), value_network(n_in)
+        self.target = copy.deepcopy(self.value).requires_grad_(False)
+        self.average = copy.deepcopy(self.actor).requires_grad_(False)
+        self.critic_adam = torch.optim.Adam(self.critics.parameters(), lr=LEARNING_RATE, fused=True)
+        self.actor_adam = torch.optim.Adam([*self.actor.parameters(), *self.value.parameters()], lr=LEARNING_RATE, fused=True)
+        self.updates = 0
+
+    def normalise(self, s):
+        """Fix the mean and deviation of the state, from random steps s (N, s_dim)."""
+        x = self.actor.inputs(s, torch.zeros(len(s), self.actor.arguments[1]))[:, :len(self.actor.s_mean)]
+        self.actor.s_mean.copy_(x.mean(0))
+        self.actor.s_std.copy_(x.std(0).clamp(min=1e-3))
+        self.average.load_state_dict(self.actor.state_dict())
+
+    def schedule(self, progress):
+        """Set the learning rate for a share of the training that is done, and return the discount factor."""
+        rate = LEARNING_RATE * min(1, (1 - progress) / max(1 - DECAY_FROM, 1e-9))
+        for group in self.critic_adam.param_groups + self.actor_adam.param_groups:
+            group["lr"] = rate
+        start, end = 1 / (1 - DISCOUNT_START), 1 / (1 - DISCOUNT)  # horizons, steps
+        return 1 - 1 / (start + (end - start) * min(1, 2 * progress))
+
+    def update(self, x, a, x2, r, discount):
+        """One update. x, x2 (B, n): Actor.inputs before and after the step; a (B, m); r (B,). Each step is followed by
+        another: a time limit is not terminal. Returns a number that is not finite if a loss is not."""
+        with torch.no_grad():
+            q_target = r + discount * self.target(x2).squeeze(1)
+        q_loss = 0.5 * ((self.critics(x, a) - q_target) ** 2).mean(1).sum()
+        self.critic_adam.zero_grad()
+        q_loss.backward()
+        self.critic_adam.step()
+        self.updates += 1
+        if self.updates % ACTOR_EVERY:
+            return q_loss.item()
+        a_new, log_prob = self.actor(x)
+        a_leaf = a_new.detach().requires_grad_()
+        q_new = self.critics(x, a_leaf).min(0).values
+        # the trap: a plain backward through q_new would also fill the critics' gradients, and cost another pass
+        slope, = torch.autograd.grad(q_new.sum(), a_leaf)
+        actor_loss = (TEMPERATURE * log_prob - (slope * a_new).sum(1)).mean()
+        v_loss = 0.5 * ((self.value(x).squeeze(1) - (q_new - TEMPERATURE * log_prob).detach()) ** 2).mean()
+        loss = actor_loss + v_loss  # they share no parameter
+        self.actor_adam.zero_grad()
+        loss.backward()
+        self.actor_adam.step()
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.target.parameters()), list(self.value.parameters()), SMOOTHING)
+            torch._foreach_lerp_(list(self.average.net.parameters()), list(self.actor.net.parameters()), AVERAGED)
+        return loss.item()
+
+
+# ---------------------------------------------------------------- reward
+
+def reward(mean, log_var, displacement, floor):
+    """Eq. 6 for one step: log p_theta(s_{t+1} | s_t, z) minus its value at the decoder's mean, (B,).
+
+    mean, log_var (B, 2 or 1) of the decoder, displacement (B, 2 or 1) in metres, floor in metres. The subtracted term depends
+    on z alone, so that the objective is the same."""
+    variance = (VARIANCE_SCALE * log_var.exp()).clamp(min=floor ** 2)
+    return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * mean) ** 2 / variance).sum(1)
+
+
+# ---------------------------------------------------------------- Algorithm 1, policy training
+
+def train_wedis(run, decoder):
+    """Alg. 1, the second loop: train run.sac to follow the decoder's single steps."""
+    m1 = run.z.shape[1]
+    while run.sac.updates < UPDATES:
+        if run.new_skills():
+            run.z = torch.randn(ROBOTS, m1)  # Alg. 1: sample z_single from the prior
+        command, _ = first_step(decoder, run.z)  # Alg. 1: z = (z_single, 0)
+        run.act(command)  # Alg. 1: execute actions; the physics of this step runs on the second core from here on
+
+        if run.warm():
+            progress = run.sac.updates / UPDATES
+            discount = run.sac.schedule(progress)
+            floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** min(1, max(0, (progress - 0.15) / 0.45))
+            s, a, s2, displacement, z = run.sample(UPDATES_PER_STEP * BATCH)  # Alg. 1: sample a transition batch
+            fresh = torch.rand(len(z), 1) < RELABELLED
+            z = torch.where(fresh, torch.randn(z.shape), z)  # any stored step can be judged by any skill
+            command, log_var = first_step(decoder, z)
+            r = reward(command, log_var, displacement, floor)  # Alg. 1: compute the reward, Eq. 6
+            x, x2 = run.sac.actor.inputs(s, command), run.sac.actor.inputs(s2, command)
+            for batch in zip(*(v.split(BATCH) for v in (x, a, x2, r))):
+                loss = run.sac.update(*batch, discount)  # Alg. 1: optimize psi and the critics
+            run.losses = dict(reward=r.mean().item(), loss=loss)
+        run.collect()  # Alg. 1: the samples go to the replay buffer R
+
+
+class Run:
+    """What the loops of WEDIS, DADS and SeCTAR share: robots, replay buffer, SAC, clock, reports and checkpoints.
+
+    All robots change skills together, so that SKILL_STEPS steps of a robot are a trajectory of the replay buffer."""
+
+    def __init__(self, z_dim, c_dim, decoder, names, config, model=None):
+        self.rng = np.random.default_rng(SEED)
+        self.robots = make_robots(ROBOTS, 1)
+        self.robots.reset(np.arange(ROBOTS), self.rng)
+        self.sac = Sac(self.robots.observe().shape[1], c_dim, self.robots.ctrl.shape[1])
+        self.model = nn.ModuleDict(model or {})  # what else a baseline learns
+        self.adam = torch.optim.Adam(self.model.parameters(), lr=LEARNING_RATE, fused=True) if model else None
+        self.widths = (self.robots.observe().shape[1], self.robots.ctrl.shape[1], self.robots.observe().shape[1],
+                       self.robots.places, z_dim)  # s, a, s', displacement, z: one row a step, one gather a batch
+        block = ROBOTS * SKILL_STEPS
+        self.replay = torch.zeros(REPLAY // block * block, sum(self.widths))
+        self.z = torch.zeros(ROBOTS, z_dim)
+        self.age = self.rng.integers(0, EPISODE, ROBOTS) // SKILL_STEPS * SKILL_STEPS  # or all would start anew at once
+        self.steps, self.unstable, self.seconds = 0, 0, 0.0
+        self.curve, self.losses, self.metric = [], {}, None
+        self.decoder, self.names, self.config = decoder, names, config
+        self.worker, self.clock, self.last_save = ThreadPoolExecutor(1), time.time(), time.time()
+        if RESUME:
+            self.resume()
+
+    def new_skills(self):
+        return self.steps % SKILL_STEPS == 0
+
+    def warm(self):
+        """Whether the warm-up is over. At its end the statistics of the state are fixed."""
+        if self.steps * ROBOTS < WARM_UP:
+            return False
+        if self.sac.updates == 0:
+            self.sac.normalise(self.replay[:self.steps * ROBOTS, :self.widths[0]])
+        return True
+
+    def act(self, command):
+        """Begin one step of all robots: a ~ pi(a | s, c), random during the warm-up. collect ends it."""
+        s = self.robots.observe()
+        a = self.sac.actor.act(s, command)
+        if self.steps * ROBOTS < WARM_UP:
+            a = torch.rand(a.shape) * 2 - 1
+        step = self.worker.submit(self.robots.step, a.numpy())
+        if THREADS == 1:
+            step.result()
+        self.begun = s, a, step
+
+    def collect(self):
+        """End the step: its samples go to the replay buffer, old robots start anew, reports and checkpoints are made."""
+        s, a, step = self.begun
+        displacement, failed = step.result()
+        rows = (self.steps * ROBOTS + torch.arange(ROBOTS)) % len(self.replay)
+        self.replay[rows] = torch.cat([s, a, self.robots.observe(), displacement, self.z], 1)
+        failed = torch.from_numpy(failed)
+        self.replay[rows[failed]] = self.replay[rows[failed] - ROBOTS]  # an unstable step means nothing: repeat the last
+        self.steps += 1
+        self.age += 1
+        over = np.flatnonzero((self.age >= EPISODE) | failed.numpy())
+        if len(over):
+            self.robots.reset(over, self.rng)
+            self.age[over] = self.steps % SKILL_STEPS
+        self.unstable += int(failed.sum())
+        self.seconds += time.time() - self.clock
+        updates, every = self.sac.updates, max(1, UPDATES // REPORTS)
+        if updates and not all(math.isfinite(value) for value in self.losses.values()):
+            stop(f"a loss is not finite after {updates} updates: {self.losses}; nothing is overwritten: go on from the last "
+                 f"good {artifact_name('policy-checkpoint', EXPERIMENT, SEED)} with --resume true, or lower "
+                 "--learning_rate", code=1)
+        if updates // every > (updates - UPDATES_PER_STEP) // every and updates or updates >= UPDATES:
+            self.report()
+        if time.time() - self.last_save > 60 * CHECKPOINT or updates >= UPDATES:
+            self.checkpoint()
+        self.clock = time.time()
+
+    def sample(self, n, recent=None):
+        """n random steps, of the `recent` latest ones: s, a, s', displacement in metres, z."""
+        filled = min(self.steps * ROBOTS, len(self.replay))
+        back = torch.randint(min(recent or filled, filled), (n,))
+        return self.replay[(self.steps * ROBOTS - 1 - back) % len(self.replay)].split(self.widths, 1)
+
+    def report(self):
+        """One line and one point of the learning curve."""
+        policy = as_policy(self.sac.average, self.decoder, self.names, {})
+        row = dict(updates=self.sac.updates, env_steps=self.steps * ROBOTS, minutes=self.seconds / 60,
+                   tracking_error=tracking(policy, False))
+        if self.names:
+            row["tracking_error_closed"] = tracking(policy, True)
+        if self.metric:
+            with torch.random.fork_rng():  # measuring leaves the training as it is
+                row["metric"] = self.metric()
+        row |= self.losses
+        self.curve.append(row)
+        left = self.seconds / 60 * (UPDATES / self.sac.updates - 1)
+        print("  ".join(f"{name} {value:.3f}" if isinstance(value, float) else f"{name} {value}"
+                        for name, value in row.items()) + f"  {self.sac.updates / self.seconds:.0f} updates/s  "
+              f"{left:.1f} min left", flush=True)
+
+    def parts(self):
+        sac = self.sac
+        networks = nn.ModuleList([sac.actor, sac.critics, sac.value, sac.target, sac.average, self.model])
+        return [part for part in (networks, sac.critic_adam, sac.actor_adam, self.adam) if part]
+
+    def checkpoint(self):
+        robots = {name: torch.from_numpy(self.robots.batch.bind(name).copy())
+                  for name in ("qpos", "qvel", "ctrl", "time", "qacc_warmstart")}
+        save(OUT, "policy-checkpoint", EXPERIMENT, SEED, self.config, parts=[part.state_dict() for part in self.parts()],
+             replay=self.replay[:self.steps * ROBOTS].clone(), z=self.z, age=torch.from_numpy(self.age), robots=robots,
+             numbers=[self.sac.updates, self.steps, self.unstable, self.seconds], curve=self.curve,
+             torch_rng=torch.get_rng_state(), numpy_rng=self.rng.bit_generator.state)
+        self.last_save = time.time()
+
+    def resume(self):
+        if not (Path(OUT) / artifact_name("policy-checkpoint", EXPERIMENT, SEED)).exists():
+            return print("there is no checkpoint yet: training from the beginning")
+        state = load(OUT, "policy-checkpoint", EXPERIMENT, SEED)
+        check_same(state, self.config, MAY_DIFFER)
+        for part, saved in zip(self.parts(), state["parts"]):
+            part.load_state_dict(saved)
+        self.replay[:len(state["replay"])] = state["replay"]
+        self.z, self.age, self.curve = state["z"], state["age"].numpy(), state["curve"]
+        self.sac.updates, self.steps, self.unstable, self.seconds = state["numbers"]
+        for name, values in state["robots"].items():
+            self.robots.batch.bind(name)[:] = values.numpy()
+        torch.set_rng_state(state["torch_rng"])
+        self.rng.bit_generator.state = state["numpy_rng"]
+
+
+# ---------------------------------------------------------------- relation functions
+
+def calibrate_relation(decoder, names, steps):
+    """Alg. 1, "Test: find relation functions", from the decoder alone: for each factor of z_multi the weight with which single
+    steps, moved by the relation function (common.next_skill), come nearest to the decoder's free run of `steps`.
+
+    Returns {factor: weight} and prints how far the steps are apart (RMS, as a share of the RMS step)."""
+    relation = {}
+    for factor in [name for name in names if name in MULTI]:
+        grid = torch.linspace(-Z_RANGE, Z_RANGE, 13)
+        pairs = torch.cartesian_prod(grid, grid)
+        z = torch.zeros(len(pairs), len(names))
+        z[:, names.index("speed")], z[:, names.index(factor)] = pairs.T  # direction 0: it stays within what 02 trains on
+        free = decoder(z, steps)[0]
+
+        def apart(weight):
+            steps_of = commands_of(as_policy(None, decoder, names, {factor: weight}), z, steps)
+            return ((steps_of - free).square().mean() / free.square().mean()).sqrt().item()
+
+        weights = np.linspace(-1, 1, 401)
+        relation[factor] = round(float(min(weights, key=apart)), 4)
+        print(f"relation function of {factor}: weight {relation[factor]:+.3f} (the paper, by hand: 0.2 for curvature, 0.1 for "
+              f"acceleration); {apart(relation[factor]):.1%} from the decoder's free run, {apart(0.0):.1%} without it")
+    return relation
+
+
+def as_policy(actor, decoder, names, relation):
+    return common.SimpleNamespace(actor=actor, decoder=decoder, names=names, relation=relation, scale=STEP_SCALE)
+
+
+# ---------------------------------------------------------------- main
+
+def main():
+    config, _ = parse_flags(globals())
+    torch.set_num_threads(1)
+    source = load(OUT, "wetvae", DECODER, DECODER_SEED)
+    decoder, names = unpack(source["decoder"]), source["names"]
+    check_constants(decoder, names)
+    torch.manual_seed(SEED)
+    if TRAIN and METHOD == "wedis":
+        relation = calibrate_relation(decoder, names, source["length"])
+        z_dim = sum(name in SINGLE for name in names)
+        run = Run(z_dim, decoder.x_dim, decoder, names, config)
+        train_wedis(run, decoder)
+    elif TRAIN:
+        run = make_baseline(config)
+        decoder, names, relation = run.decoder, [], {}
+        dict(dads=train_dads, sectar=train_sectar)[METHOD](run)
+    if TRAIN:
+        save(OUT, "policy", EXPERIMENT, SEED, config, actor=pack(run.sac.average), decoder=pack(decoder), method=METHOD,
+             robot=ROBOT, names=names, relation=relation, scale=STEP_SCALE, length=source["length"], curve=run.curve,
+             updates=run.sac.updates, env_steps=run.steps * ROBOTS, seconds=run.seconds)
+        if run.unstable:
+            print(f"{run.unstable} steps were unstable in MuJoCo: those robots started anew, the steps are left out")
+    policy = load_policy(OUT, EXPERIMENT, SEED)
+    if (policy.method, policy.robot, policy.scale) != (METHOD, ROBOT, STEP_SCALE):
+        stop(f"{artifact_name('policy', EXPERIMENT, SEED)} was trained with --method {policy.method} --robot {policy.robot} "
+             f"--step_scale {policy.scale}; give the same, or train anew")
+    measure(policy, source["ranges"])
+    draw_skills(policy)
+    draw_learning_curve(policy.curve)
+    draw_robots()
+
+
+def check_constants(decoder, names):
+    """Whatever makes no sense ends here, before training, with what fits."""
+    if METHOD not in ("wedis", "dads", "sectar") or ROBOT not in ("ant", "half_cheetah"):
+        stop("--method is wedis, dads or sectar; --robot is ant or half_cheetah")
+    if METHOD != "wedis" and ROBOT != "ant" or METHOD == "sectar" and Z_DIM < 3:
+        stop("DADS and SeCTAR learn on the Ant alone: --robot ant; SeCTAR's --z_dim is at least 3")
+    if names[0] != "speed" or not set(names) <= set(SINGLE + MULTI):
+        stop(f"the decoder {DECODER} has axes {' '.join(names)}, a policy needs speed, and may have direction, curvature, "
+             "acceleration: choose another --decoder")
+    if decoder.x_dim != make_robots(1, 1).places:
+        stop(f"the decoder {DECODER} predicts {decoder.x_dim} coordinates, too few or too many for the {ROBOT}: choose "
+             "another --decoder or --robot")
+    if BASE_FRAME and ROBOT != "ant":
+        stop("only a robot in the plane has a base frame: --base_frame false")
+    above_0 = dict(UPDATES=UPDATES, ROBOTS=ROBOTS, EPISODE=EPISODE, SKILL_STEPS=SKILL_STEPS, WARM_UP=WARM_UP, BATCH=BATCH,
+                   UPDATES_PER_STEP=UPDATES_PER_STEP, HIDDEN=HIDDEN, THREADS=THREADS, REPORTS=REPORTS, Z_DIM=Z_DIM,
+                   ACTOR_EVERY=ACTOR_EVERY, RECENT=RECENT, MODEL_BATCH=MODEL_BATCH, PRIOR_SAMPLES=PRIOR_SAMPLES,
+                   DIRECTIONS=DIRECTIONS, NOISY=NOISY, STARTS=STARTS, STEP_SCALE=STEP_SCALE, FLOOR_START=FLOOR_START,
+                   FLOOR_END=FLOOR_END, VARIANCE_SCALE=VARIANCE_SCALE, LEARNING_RATE=LEARNING_RATE, Z_RANGE=Z_RANGE,
+                   SINGLE_RUN=min(SINGLE_RUN), MULTI_RUN=min(MULTI_RUN), TRAVERSAL=TRAVERSAL - 1)
+    for name, value in above_0.items():
+        if value <= 0:
+            stop(f"--{name.lower()} is too small")
+    if max(DISCOUNT, DISCOUNT_START) >= 1 or max(RELABELLED, EXPLORE, AVERAGED, SMOOTHING, DECAY_FROM) > 1:
+        stop("discounts must be below 1; shares and rates at most 1")
+    block = ROBOTS * SKILL_STEPS
+    if EPISODE % SKILL_STEPS or REPLAY < max(WARM_UP, 2 * block) or METHOD == "sectar" and WARM_UP < block:
+        stop(f"--skill_steps must divide --episode; --replay must be at least --warm_up and {2 * block} (two skills of all "
+             f"robots), and for SeCTAR --warm_up at least {block}")
+
+
+# ================================================================ Baselines: not needed to understand WEDIS
+
+def make_baseline(config):
+    """The Run of DADS or SeCTAR, with the networks that it learns beside the policy."""
+    if METHOD == "dads":
+        dynamics = SkillDynamics(Z_DIM)
+        return Run(Z_DIM, Z_DIM, dynamics, [], config, dict(decoder=dynamics))
+    decoder = Decoder(Z_DIM, 2, 64)
+    return Run(Z_DIM, 2, decoder, [], config, dict(decoder=decoder, encoder=TrajectoryEncoder()))
+
+
+def train_dads(run):
+    """Sharma et al. 2019: skills z ~ U(-1, 1)^2; a step is worth its mutual information with z under the skill dynamics
+    q(displacement | z), which learn too. The reward is computed with the q of now, so that old and relabelled steps count."""
+    q = run.decoder
+
+    def log_q(displacement, log_weight, mean):
+        """log q: displacement (B, 2) under its own mixture -> (B,); (B, 1, 2) under all L mixtures -> (B, L)."""
+        x = (displacement / STEP_SCALE - q.x_mean) / q.x_std
+        return (log_weight - 0.5 * (x[..., None, :] - mean).square().sum(-1)).logsumexp(-1) - math.log(2 * math.pi)
+
+    @torch.no_grad()
+    def information(displacement, z):
+        """log(L + 1) - log(1 + sum_i exp(log q(.|z_i) - log q(.|z))), (B,); the L samples of the prior are the same for all."""
+        own = log_q(displacement, *q.mixture(z))
+        others = log_q(displacement[:, None], *q.mixture(torch.rand(PRIOR_SAMPLES, Z_DIM) * 2 - 1))
+        return math.log(PRIOR_SAMPLES + 1) - (1 + (others - own[:, None]).clamp(-50, 50).exp().sum(1)).log()
+
+    def metric():
+        _, _, _, displacement, z = run.sample(4096, RECENT)
+        return information(displacement, z).mean().item()
+
+    run.metric = metric
+    while run.sac.updates < UPDATES:
+        if run.new_skills():
+            run.z = torch.rand(ROBOTS, Z_DIM) * 2 - 1
+        run.act(run.z)
+        if run.warm():
+            # q learns from recent steps and the skills that made them (from relabelled ones it would learn that z means nothing)
+            _, _, _, displacement, z = run.sample(MODEL_BATCH, RECENT)
+            q.x_mean.lerp_(displacement.mean(0) / STEP_SCALE, 0.02)
+            q.x_std.lerp_(displacement.std(0) / STEP_SCALE, 0.02)
+            loss = -log_q(displacement, *q.mixture(z)).mean()
+            run.adam.zero_grad()
+            loss.backward()
+            run.adam.step()
+
+            discount = run.sac.schedule(run.sac.updates / UPDATES)
+            s, a, s2, displacement, z = run.sample(UPDATES_PER_STEP * BATCH)
+            fresh = torch.rand(len(z), 1) < RELABELLED
+            z = torch.where(fresh, torch.rand(z.shape) * 2 - 1, z)
+            r = REWARD_SCALE * information(displacement, z)
+            x, x2 = run.sac.actor.inputs(s, z), run.sac.actor.inputs(s2, z)
+            for batch in zip(*(v.split(BATCH) for v in (x, a, x2, r))):
+                run.sac.update(*batch, discount)
+            run.losses = dict(reward=r.mean().item(), loss=loss.item())
+        run.collect()
+
+
+class TrajectoryEncoder(nn.Module):
+    """q_phi(z | tau) of SeCTAR: a bidirectional LSTM over displacements (B, T, 2), mean-pooled. Returns mean, log-variance."""
+
+    def __init__(self, hidden=64):
+        super().__init__()
+        self.lstm, self.head = nn.LSTM(2, hidden, bidirectional=True, batch_first=True), nn.Linear(2 * hidden, 2 * Z_DIM)
+
+    def forward(self, x):
+        return self.head(self.lstm(x)[0].mean(1)).chunk(2, 1)
+
+
+EXPLORER = 3.0  # last entry of the z of SeCTAR's explorer: far from N(0, I), and no plan asks for it
+
+
+def train_sectar(run):
+    """Co-Reyes et al. 2018: skills z ~ N(0, I) for SKILL_STEPS steps. Encoder and state decoder learn from the trajectories of
+    an explorer. A skill's trajectory is worth the likelihood of ending where the state decoder says; the explorer's, what the
+    VAE can not reconstruct. The explorer is the same policy, asked for steps that are far too long, in any direction."""
+    encoder, decoder = run.model["encoder"], run.decoder
+
+    def elbo(x):
+        """x (B, T, 2) in trajectory units -> sum_t log p(x_t | z) and KL(q || p), (B,) each, and decoded means (B, T, 2)."""
+        mean, log_var = encoder(x)
+        kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1)
+        decoded, variance = decoder(mean + (0.5 * log_var).exp() * torch.randn_like(mean), SKILL_STEPS)
+        variance = variance.exp().clamp(min=(FLOOR_END / STEP_SCALE) ** 2)  # or standing still has a likelihood without bound
+        return -0.5 * (variance.log() + (x - decoded) ** 2 / variance).sum((1, 2)), kl, decoded
+
+    def trajectories(n, recent):
+        """n random whole trajectories of the `recent` latest steps: rows (n, T) of the replay buffer."""
+        block = ROBOTS * SKILL_STEPS
+        done = run.steps // SKILL_STEPS
+        back = torch.randint(max(1, min(done, len(run.replay) // block - 1, recent // block)), (n,))
+        first = (done - 1 - back) % (len(run.replay) // block) * block + torch.randint(ROBOTS, (n,))
+        return first[:, None] + ROBOTS * torch.arange(SKILL_STEPS)
+
+    def steps_of(z, decoded):
+        """Commands (B, T, 2) of skills and explorers alike."""
+        return torch.where(z[:, None, -1:] == EXPLORER, z[:, None, :2].expand_as(decoded), decoded)
+
+    @torch.no_grad()
+    def metric():
+        x = run.replay[trajectories(512, RECENT)].split(run.widths, 2)[3] / STEP_SCALE
+        path, decoded = x.cumsum(1), decoder(encoder(x)[0], SKILL_STEPS)[0].cumsum(1)
+        return ((decoded - path).square().mean() / path.square().mean()).sqrt().item()  # reconstruction error
+
+    run.metric = metric
+    while run.sac.updates < UPDATES:
+        if run.new_skills():
+            run.z = torch.randn(ROBOTS, Z_DIM)
+            explorers = torch.rand(ROBOTS) < EXPLORE
+            run.z[explorers, :2] = EXPLORER * nn.functional.normalize(run.z[explorers, :2])
+            run.z[explorers, -1] = EXPLORER
+        with torch.no_grad():
+            commands = steps_of(run.z, decoder(run.z, SKILL_STEPS)[0])
+        run.act(commands[:, run.steps % SKILL_STEPS])
+        if run.warm():
+            _, _, _, x, z = run.replay[trajectories(MODEL_BATCH, RECENT)].split(run.widths, 2)
+            mine = (z[:, 0, -1] == EXPLORER) | (EXPLORE == 0)
+            log_p, kl, _ = elbo(x / STEP_SCALE)
+            loss = ((KL_WEIGHT * kl - log_p) * mine).sum() / mine.sum().clamp(min=1)
+            run.adam.zero_grad()
+            loss.backward()
+            run.adam.step()
+
+            discount = run.sac.schedule(run.sac.updates / UPDATES)
+            share = min(16, SKILL_STEPS)  # steps of each trajectory in the batch: decoded once
+            rows = trajectories(max(1, UPDATES_PER_STEP * BATCH // share), len(run.replay))
+            t = torch.randint(SKILL_STEPS, (len(rows), share))
+            x = run.replay[rows].split(run.widths, 2)[3] / STEP_SCALE
+            z = run.replay[rows[:, 0]].split(run.widths, 1)[4]
+            explorer = z[:, -1] == EXPLORER
+            fresh = (torch.rand(len(z)) < RELABELLED) & ~explorer
+            z[fresh] = torch.randn(int(fresh.sum()), Z_DIM)
+            with torch.no_grad():
+                decoded = decoder(z, SKILL_STEPS)[0]
+                decoded[explorer] = elbo(x[explorer])[2] if explorer.any() else decoded[explorer]
+                # how far from the decoded place a trajectory ends (a Laplace likelihood of the place), shared among its steps;
+                # by single steps a skill would be paid for not trembling, which is standing still
+                miss = x - decoded
+                away = (miss * nn.functional.normalize(miss.sum(1))[:, None]).sum(2).gather(1, t)
+                r = REWARD_SCALE * torch.where(explorer[:, None], away, -away).flatten()
+                commands, i = steps_of(z, decoded), torch.arange(len(rows))[:, None]
+                c, c2 = commands[i, t].flatten(0, 1), commands[i, (t + 1).clamp(max=SKILL_STEPS - 1)].flatten(0, 1)
+                s, a, s2, _, _ = run.replay[rows.gather(1, t).flatten()].split(run.widths, 1)
+                x, x2 = run.sac.actor.inputs(s, c), run.sac.actor.inputs(s2, c2)
+            order = torch.randperm(len(x))
+            for batch in zip(*(v[order].split(BATCH) for v in (x, a, x2, r))):
+                run.sac.update(*batch, discount)
+            run.losses = dict(reward=r.mean().item(), loss=loss.item())
+        run.collect()
+
+
+# ================================================================ Measuring and drawing: not needed to understand WEDIS
+
+def make_robots(n, threads):
+    return Robots(ant_spec() if ROBOT == "ant" else half_cheetah_spec(), n, threads)
+
+
+def traversal(policy, axis, values):
+    """Skills with one axis at values, the others at 0; acceleration at z_speed = -1 in one dimension, where it is nothing
+    at speed 0."""
+    z = torch.zeros(len(values), len(policy.names) or Z_DIM)
+    if policy.names == ["speed", "acceleration"] and axis == 1:
+        z[:, 0] = -1
+    z[:, axis] = torch.as_tensor(values, dtype=torch.float32)
+    return z
+
+
+def grid(policy):
+    """Skills of the tracking error, z_multi = 0. In the plane 5 speeds x DIRECTIONS; on a rail 8 speeds; DADS 5 x 5; SeCTAR, of
+    eight axes, 25 fixed draws from the prior."""
+    ends = torch.linspace(-Z_RANGE, Z_RANGE, 5)
+    if METHOD == "sectar":
+        return torch.randn(25, Z_DIM, generator=torch.Generator().manual_seed(0))
+    if METHOD == "wedis" and "direction" not in policy.names:
+        z = torch.linspace(-Z_RANGE, Z_RANGE, 9)[torch.arange(9) != 4][:, None]
+    else:
+        circle = METHOD == "wedis" and policy.decoder.circle is not None  # its two ends are one direction
+        z = torch.cartesian_prod(ends, torch.linspace(-Z_RANGE, Z_RANGE, DIRECTIONS + circle)[:DIRECTIONS])
+    return nn.functional.pad(z, (0, (len(policy.names) or Z_DIM) - z.shape[1]))
+
+
+def roll_out(policy, z, run, closed, noise=None, run_in=0):
+    """Execute skills z (n, M) with mean actions. run: (T, H_z). Returns places (n, T * H_z + 1, 2 or 1) in metres. From rest, or
+    with noise (a seed) from noisy starts; recorded after run_in steps (from rest a first step is short)."""
+    robots = make_robots(len(z), THREADS)
+    if noise is not None:
+        robots.reset(np.arange(len(z)), np.random.default_rng(noise))
+    commands = commands_of(policy, z, int(run[0]))
+    for _ in execute(policy, robots, commands[:, :1], run_in, closed, True):
+        pass
+    places = [robots.place()]
+    for _ in execute(policy, robots, commands, int(run[1]), closed, True):
+        places.append(robots.place())
+    return torch.stack(places, 1).numpy()
+
+
+def predicted_path(policy, z, run):
+    """The decoder's free run of T transitions, each H_z steps long: places (n, T + 1, 2 or 1) in metres."""
+    with torch.no_grad():
+        path = run[1] * policy.scale * policy.decoder(z, int(run[0]))[0].cumsum(1)
+    return nn.functional.pad(path, (0, 0, 1, 0)).numpy()
+
+
+def tracking(policy, closed):
+    """Tracking error: RMS(executed end - predicted end) / RMS(predicted end) over the grid, from rest."""
+    z = grid(policy)
+    executed, predicted = roll_out(policy, z, SINGLE_RUN, closed)[:, -1], predicted_path(policy, z, SINGLE_RUN)[:, -1]
+    return math.sqrt(((executed - predicted) ** 2).sum() / (predicted ** 2).sum())
+
+
+def following(policy, closed):
+    """Following error: three random skills one after another, as a planner draws them, from noisy starts. Returns median and
+    90 % quantile of |executed - predicted end| of a skill in metres, and the share of robots that ever turn over."""
+    rng = np.random.default_rng(SEED)
+    robots = make_robots(STARTS, THREADS)
+    robots.reset(np.arange(STARTS), rng)
+    fallen, away = np.zeros(STARTS, bool), []
+    for _ in range(3):
+        z = torch.from_numpy(rng.uniform(-Z_RANGE, Z_RANGE, (STARTS, len(policy.names)))).float()
+        if "direction" in policy.names:
+            z[:, 0].abs_()  # no slow skills, App. A.1.4; on a rail the sign of the speed is the direction
+        commands = commands_of(policy, z, int(MULTI_RUN[0]))
+        predicted = robots.place() + MULTI_RUN[1] * policy.scale * commands.sum(1)
+        for _ in execute(policy, robots, commands, int(MULTI_RUN[1]), closed, True):
+            fallen |= robots.upside_down()
+        away.append((robots.place() - predicted).norm(dim=1).numpy())
+    return float(np.median(away)), float(np.quantile(away, 0.9)), float(fallen.mean())
+
+
+def executed_cross_talk(policy, ranges, closed):
+    """Cross-talk C (axes, factors) of executed skills, the mean over noisy starts; displacements per fifth of a skill."""
+    values, curves = np.linspace(-Z_RANGE, Z_RANGE, TRAVERSAL), []
+    every = max(1, int(MULTI_RUN[0] * MULTI_RUN[1]) // 5)
+    for axis in range(len(policy.names) or Z_DIM):
+        z = traversal(policy, axis, values).repeat(NOISY, 1)
+        places = roll_out(policy, z, MULTI_RUN, closed, noise=SEED + 1, run_in=int(MULTI_RUN[1]))[:, ::every]
+        steps = np.diff(places, axis=1).reshape(NOISY, TRAVERSAL, places.shape[1] - 1, -1).mean(0)
+        curves.append(factors_of(steps / (every * policy.scale), list(ranges)))
+    return cross_talk(curves, ranges)
+
+
+def match(C):
+    """Which axis is which factor, one-to-one, so that their purities sum to most (the axes of baselines have no names). With fewer
+    axes than factors some factors have none. Returns {factor: axis}, by number."""
+    share = C / np.maximum(C.sum(1, keepdims=True), 1e-9)
+    axes = list(range(len(C))) + [None] * C.shape[1]
+    best = max(permutations(axes, C.shape[1]), key=lambda pick: sum(share[i, j] for j, i in enumerate(pick) if i is not None))
+    return {j: i for j, i in enumerate(best) if i is not None}
+
+
+def measure(policy, ranges):
+    """Print and write one row of results/policies.csv. _open: open loop, as in the paper."""
+    row = dict(experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy.updates, env_steps=policy.env_steps,
+               train_minutes=policy.seconds / 60, tracking_error=tracking(policy, False))
+    columns = [*row] + ["tracking_error_closed"]
+    for end in ("_open", ""):
+        columns += [name + end for name in ("follow_median_m", "follow_p90_m", "fall_rate")]
+        columns += [f"purity_{name}{end}" for name in SINGLE + MULTI]
+    C = executed_cross_talk(policy, ranges, False)
+    axes = {j: j for j in range(len(ranges))} if policy.names else match(C)
+    row |= {f"purity_{name}_open": purity(C, axes[j], j) for j, name in enumerate(ranges) if j in axes}
+    if policy.names:
+        row["tracking_error_closed"] = tracking(policy, True)
+        for closed, end in ((False, "_open"), (True, "")):
+            found = following(policy, closed)
+            row |= {"follow_median_m" + end: found[0], "follow_p90_m" + end: found[1], "fall_rate" + end: found[2]}
+        C = executed_cross_talk(policy, ranges, True)
+        row |= {f"purity_{name}": purity(C, j, j) for j, name in enumerate(ranges)}
+    if policy.curve and "metric" in policy.curve[-1]:
+        row["metric"] = policy.curve[-1]["metric"]
+    for name, value in row.items():
+        print(f"{name:24s} {value:.3f}" if isinstance(value, float) else f"{name:24s} {value}")
+    update_csv(Path(OUT) / "results" / "policies.csv", [{name: row.get(name, "") for name in columns + ["metric"]}],
+               ("experiment", "seed"))
+
+
+def draw_skills(policy):
+    """Fig 5, 15, 16: predicted and executed skills, open and (WEDIS) closed loop; a column per axis. On a rail the latent is on
+    the y axis, and transitions have colours."""
+    names = policy.names or [str(i + 1) for i in range(Z_DIM)]
+    rows = ("predicted", "executed, open loop", "executed, closed loop")[:2 + bool(policy.names)]
+    size = 3.0 if len(names) < 5 else 2.0
+    figure, axes = plt.subplots(len(rows), len(names), figsize=(size * len(names) + 1, size * len(rows)), squeeze=False)
+    for i, name in enumerate(names):
+        rail = policy.decoder.x_dim == 1
+        run = MULTI_RUN if rail or name in MULTI else SINGLE_RUN
+        values, colours = np.array(list(common.LATENT_COLOURS)), list(common.LATENT_COLOURS.values())
+        if rail:
+            values = np.linspace(-1, 1, 9)
+        elif name == "direction" and policy.decoder.circle is not None:
+            values = np.linspace(-1.5, 1.5, DIRECTIONS + 1)[:-1]
+            colours = plt.get_cmap("twilight")(np.linspace(0.1, 0.9, DIRECTIONS))
+        z = traversal(policy, i, values)
+        paths = [predicted_path(policy, z, run)] + [roll_out(policy, z, run, closed) for closed in (False, True)]
+        paths = paths[:len(rows)]
+        low, high = np.min([path.min((0, 1)) for path in paths], 0), np.max([path.max((0, 1)) for path in paths], 0)
+        middle, reach = (low + high) / 2, 0.6 * (high - low).max() + 0.01  # one scale for all rows of a column
+        for ax, path in zip(axes[:, i], paths):
+            marks = path[:, ::1 if path is paths[0] else int(run[1])]
+            for t, colour in enumerate(plt.get_cmap("plasma")(np.linspace(0, 0.85, marks.shape[1])) if rail else ()):
+                ax.plot(marks[:, t, 0], values, ".", color=colour, label=f"t = {t}")
+            for line, dots, value, colour in zip(path, marks, values, () if rail else colours):
+                ax.plot(*line.T, color=colour, lw=1.3, label=f"{value:g}")
+                ax.plot(*dots.T, "o", ms=3 if len(dots) < 10 else 0, color=colour)
+            ax.set(xlim=(middle[0] - reach, middle[0] + reach))
+            if not rail:
+                ax.set(ylim=(middle[1] - reach, middle[1] + reach), aspect="equal")
+        axes[0, i].set_title(f"$z_{{{name}}}$, $T$ = {int(run[0])}, $H_z$ = {int(run[1])}")
+        axes[-1, i].set_xlabel("x (m)")
+        if len(values) > 9:
+            axes[0, i].legend(fontsize=5, ncols=2, handlelength=1)
+    for ax, text in zip(axes[:, 0], rows):
+        ax.set_ylabel(f"{text}\n" + ("latent" if policy.decoder.x_dim == 1 else "y (m)"))
+    handles = axes[0, 0].get_legend_handles_labels()
+    figure.legend(*handles, title="transition" if policy.decoder.x_dim == 1 else "latent", loc="outside right upper")
+    save_figure(figure, OUT, FIGURE or f"skills_{EXPERIMENT}")
+
+
+def draw_learning_curve(curve):
+    """Tracking error and, of a baseline, its own measure against the minutes of training; a line per seed."""
+    folder, name = Path(OUT) / "results", f"learning_curve_{EXPERIMENT}"
+    if not curve:
+        return
+    update_csv(folder / f"{name}_seed{SEED}.csv", curve, ())
+    curves = [read_csv(path) for path in sorted(folder.glob(f"{name}_seed*.csv"))]
+    shown = {"tracking_error": "tracking error, open loop", "tracking_error_closed": "tracking error, closed loop",
+             "metric": dict(dads="mutual information (nats)", sectar="reconstruction error").get(METHOD)}
+    shown = {column: label for column, label in shown.items() if column in curve[-1]}
+    figure, axes = plt.subplots(1, len(shown), figsize=(4 * len(shown), 2.8), squeeze=False)
+    for ax, (column, label) in zip(axes[0], shown.items()):
+        for rows in curves:
+            ax.plot([float(row["minutes"]) for row in rows], [float(row[column]) for row in rows], lw=1.2, color=common.BLUE)
+        ax.set(xlabel=f"minutes of training, {len(curves)} seed(s)", ylabel=label)
+        if "error" in label:
+            ax.set_ylim(0, 1.1)
+    save_figure(figure, OUT, name)
+
+
+def draw_robots():
+    """Fig 14: both robots, rendered by MuJoCo off-screen."""
+    figure, axes = plt.subplots(1, 2, figsize=(8, 3.2))
+    for ax, title, spec, look in zip(axes, ("Ant", "Half-Cheetah"), (ant_spec(), half_cheetah_spec()), (0.5, 0.5)):
+        model = spec.compile()
+        data, camera = mujoco.MjData(model), mujoco.MjvCamera()
+        data.qpos[:] = model.key_qpos[0] if model.nkey else model.qpos0
+        mujoco.mj_forward(model, data)
+        camera.lookat, camera.distance, camera.azimuth, camera.elevation = (0, 0, look), 3, 120, -20
+        try:
+            renderer = mujoco.Renderer(model, 400, 500)
+        except Exception:  # no GL library, no device: the kinds differ by platform
+            print("no Fig 14: MuJoCo's renderer needs a GL library, such as libegl1 (Debian, Ubuntu)")
+            return plt.close(figure)
+        renderer.update_scene(data, camera)
+        ax.imshow(renderer.render())
+        ax.set(title=title, xticks=[], yticks=[])
+        ax.grid(False)
+    save_figure(figure, OUT, "fig14_robots")
 
 
 def half_cheetah_spec():
@@ -141,693 +835,5 @@ def half_cheetah_spec():
     return spec
 
 
-# ---------------------------------------------------------------- SAC: twin critics, value network, fixed temperature
-
-class Critics(nn.Module):
-    """Q_1 and Q_2 as one stack of batched matrix products (one call instead of two). (B, n), (B, m) -> (2, B)."""
-
-    def __init__(self, n_in):
-        super().__init__()
-        sizes = [n_in, HIDDEN, HIDDEN, 1]
-        layers = [[nn.Linear(a, b) for a, b in zip(sizes, sizes[1:])] for _ in range(2)]  # torch's own initialisation
-        self.weights = nn.ParameterList(torch.stack([one.weight.T, two.weight.T]).detach() for one, two in zip(*layers))
-        self.biases = nn.ParameterList(torch.stack([one.bias, two.bias])[:, None].detach() for one, two in zip(*layers))
-
-    def forward(self, x, a):
-        h = torch.cat([x, a], 1).expand(2, -1, -1)
-        h = torch.relu(torch.baddbmm(self.biases[0], h, self.weights[0]))
-        h = torch.relu(torch.baddbmm(self.biases[1], h, self.weights[1]))
-        return (h * self.weights[2].mT).sum(2) + self.biases[2].squeeze(2)  # a product with one column is faster as a sum
-
-
-def value_network(n_in):
-    return nn.Sequential(nn.Linear(n_in, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 1))
-
-
-def reward(mean, log_var, displacement, floor):
-    """Eq. 6 for one step: log p(displacement | z_single, z_multi = 0) minus its value at the decoder's mean, (B,).
-
-    mean, log_var (B, 2) of the decoder, displacement (B, 2) in metres, floor in metres. The subtracted term depends on z only: same objective."""
-    variance = (VARIANCE_SCALE * log_var.exp()).clamp(min=floor ** 2)
-    return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * mean) ** 2 / variance).sum(1)
-
-
-class Wedis:
-    """Skills from the prior; a step is worth the decoder's log-likelihood (Eq. 6); the decoder is trained already."""
-    model, metric = nn.ModuleDict(), None
-
-    def __init__(self, decoder):
-        self.decoder, self.z_dim, self.span = decoder, AXES - 1, 1  # span: steps that are judged together
-
-    def sample(self, n):
-        return torch.randn(n, self.z_dim)
-
-    def reward(self, displacement, t, z, floor):
-        step, log_var = first_step(self.decoder, z)
-        return reward(step, log_var, displacement[:, 0], floor), step, step
-
-    def loss(self, s, a, displacement, z, actor):
-        return torch.zeros(())
-
-
-class Dads:
-    """Sharma et al. 2019. Skills z ~ U(-1, 1)^2; a step is worth its mutual information with z under q(displacement | z); q learns.
-
-    The reward is computed anew for each batch, with the q of now, so that old steps and relabelled ones can be used (off-policy DADS)."""
-    metric = "mutual information (nats)"
-
-    def __init__(self):
-        self.decoder, self.z_dim, self.span = SkillDynamics(AXES), AXES, 1
-        self.model = nn.ModuleDict(dict(decoder=self.decoder))
-
-    def sample(self, n):
-        return torch.rand(n, self.z_dim) * 2 - 1
-
-    def information(self, displacement, z):
-        """log(L + 1) - log(1 + sum_i exp(log q(.|z_i) - log q(.|z))), (B,), of displacements (B, 2) in metres. The L prior samples are
-        the same for all B: q reads z alone, so that they cost L evaluations and not L B."""
-        x = (displacement / STEP_SCALE - self.decoder.x_mean) / self.decoder.x_std
-        own = self.decoder.log_prob(x, *self.decoder.mixture(z))
-        others = self.decoder.log_prob(x[:, None], *self.decoder.mixture(self.sample(PRIOR_SAMPLES)))
-        return math.log(PRIOR_SAMPLES + 1) - (1 + (others - own[:, None]).clamp(-50, 50).exp().sum(1)).log()
-
-    def reward(self, displacement, t, z, floor):
-        return REWARD_SCALE * self.information(displacement[:, 0], z), z, z
-
-    def loss(self, s, a, displacement, z, actor):
-        """-log q of recent steps under the skills that made them (never under relabelled ones: q would learn that z means nothing)."""
-        x = displacement[:, 0] / STEP_SCALE
-        self.decoder.x_mean.lerp_(x.mean(0), MOMENTS), self.decoder.x_std.lerp_(x.std(0), MOMENTS)  # q's unit deviation is in these units
-        return -self.decoder.log_prob((x - self.decoder.x_mean) / self.decoder.x_std, *self.decoder.mixture(z[:, 0])).mean()
-
-    def measure(self, displacement, z):
-        return self.information(displacement[:, 0], z[:, 0]).mean().item()
-
-
-class Encoder(nn.Module):
-    """q_phi(z | tau) of SeCTAR: a bidirectional LSTM over displacements (B, T, 2), mean-pooled. Returns mean, log-variance (B, AXES)."""
-
-    def __init__(self, hidden=64):
-        super().__init__()
-        self.lstm, self.head = nn.LSTM(2, hidden, bidirectional=True, batch_first=True), nn.Linear(2 * hidden, 2 * AXES)
-
-    def forward(self, x):
-        return self.head(self.lstm(x)[0].mean(1)).chunk(2, 1)
-
-
-class Sectar:
-    """Co-Reyes et al. 2018. Skills z ~ N(0, I) for SKILL_STEPS steps, worth the likelihood of ending where the state decoder says. Encoder,
-    state decoder and, by cloning, the policy learn from the explorer's trajectories. The explorer is the same policy, told EXPLORER
-    instead of a skill, and worth what the VAE cannot reconstruct; skills begin where it ends, and both learn from both's trajectories."""
-    metric = "reconstruction error"
-
-    def __init__(self):
-        self.decoder, self.encoder, self.z_dim, self.span = Decoder(AXES), Encoder(), AXES, SKILL_STEPS
-        self.model = nn.ModuleDict(dict(decoder=self.decoder, encoder=self.encoder))
-
-    def sample(self, n):
-        return torch.where(torch.rand(n, 1) < EXPLORE, self.explorers(n), torch.randn(n, self.z_dim))
-
-    def explorers(self, n):
-        """What tells the policy to explore, (n, AXES): a step that is far too long, anywhere, and a mark."""
-        return nn.functional.pad(EXPLORER * nn.functional.normalize(torch.randn(n, 2)), (0, self.z_dim - 2), value=EXPLORER)
-
-    def posterior(self, x):
-        """Displacements x (B, T, 2) in trajectory units -> a sample of q(z | tau) (B, AXES), its KL divergence from the prior (B,)."""
-        mean, log_var = self.encoder(x)
-        return mean + (0.5 * log_var).exp() * torch.randn_like(mean), 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1)
-
-    def decode(self, z):
-        """Mean and log-variance (B, SKILL_STEPS, 2) in trajectory units. Without a floor the likelihood of standing still has no bound."""
-        mean, log_var = self.decoder.unroll(z, SKILL_STEPS)
-        return mean, log_var.clamp(min=2 * math.log(FLOOR_END / STEP_SCALE))
-
-    def reward(self, displacement, t, z, floor):
-        """displacement (K, T, 2) of whole trajectories, t (n, K): the steps of each that are asked for, z (K, AXES) -> (n K,), and
-        what the policy is told at t and after it (n K, 2). No floor: a place, unlike a step, does not tremble."""
-        x, explorer, i, told = displacement / STEP_SCALE, z[:, -1] == EXPLORER, torch.arange(len(z)), z
-        if explorer.any():
-            z = z.clone()
-            z[explorer], _ = self.posterior(x[explorer])
-        mean, _ = self.decode(z)
-        steps, miss = torch.where(explorer[:, None, None], told[:, None, :2], mean), x - mean
-        # how far from the decoded place a trajectory ends (a Laplace likelihood of the place), shared among its steps; by single steps
-        # a skill would be paid for not trembling, which is standing still, and the explorer for trembling
-        away = (miss * nn.functional.normalize(miss.sum(1))[:, None]).sum(2)[i, t]
-        r = REWARD_SCALE * torch.where(explorer, away, -away)
-        return r.flatten(), *(steps[i, u].flatten(0, 1) for u in (t, (t + 1).clamp(max=SKILL_STEPS - 1)))
-
-    def elbo(self, x):
-        """Displacements (B, T, 2) in trajectory units -> sum_t log p(x_t | z), KL(q || p), both (B,), and the decoded means (B, T, 2)."""
-        z, kl = self.posterior(x)
-        mean, log_var = self.decode(z)
-        return -0.5 * (log_var + math.log(2 * math.pi) + (x - mean) ** 2 / log_var.exp()).sum((1, 2)), kl, mean
-
-    def loss(self, s, a, displacement, z, actor):
-        """Negative ELBO of the explorer's recent trajectories (without one: of all) and cloning of eight actions of each, by the policy told
-        what is decoded from q's z. Skills that stand still would teach the prior to stand still."""
-        mine = (z[:, 0, -1] == EXPLORER) | (EXPLORE == 0)
-        log_p, kl, steps = self.elbo(displacement / STEP_SCALE)
-        i, t = torch.arange(len(s))[:, None], torch.randint(SKILL_STEPS, (len(s), 8))
-        x, turns = actor.inputs(s[i, t].flatten(0, 1), None, steps[i, t].flatten(0, 1))
-        action, _ = actor(x, deterministic=True)
-        miss = 0.5 * ((action - actor.seen(a[i, t].flatten(0, 1), turns)) ** 2).sum(1).view(-1, 8).mean(1)
-        return VAE_SCALE * ((KL_WEIGHT * kl - log_p + CLONING * miss) * mine).sum() / mine.sum().clamp(min=1)
-
-    def reconstruction_error(self, x):
-        """Displacements (B, T, 2) in trajectory units -> RMS over all places of (decoded from q's mean - executed) / RMS executed."""
-        path = x.cumsum(1)
-        return ((self.decode(self.encoder(x)[0])[0].cumsum(1) - path).square().mean() / path.square().mean()).sqrt().item()
-
-    def measure(self, displacement, z):
-        return self.reconstruction_error(displacement / STEP_SCALE)
-
-
-METHODS = dict(wedis=Wedis, dads=Dads, sectar=Sectar)
-
-
-def trajectories(n, span, env_steps, replay, recent):
-    """Rows of replay (n, span) of n random trajectories of `span` steps, complete ones among the `recent` latest steps. A step of all
-    robots is ROBOTS rows, so a robot's next step is ROBOTS rows on; trajectories begin together (or span is 1)."""
-    block = ROBOTS * span
-    done, kept = env_steps // block, len(replay) // block
-    back = torch.randint(max(1, min(done, kept - 1, recent // block)), (n,))  # kept - 1: one is being overwritten
-    return (((done - 1 - back) % kept * block + torch.randint(ROBOTS, (n,)))[:, None] + ROBOTS * torch.arange(span))
-
-
-def sac_losses(actor, critics, value, target, x, a, x2, r):
-    """Losses of the actor, the twin critics and the value network (Haarnoja et al. 2018). x, x2 (B, n): state and skill
-    before and after the step; a (B, m); r (B,). Every step is followed by another: time limits are not terminal."""
-    with torch.no_grad():
-        q_target = r + DISCOUNT * target(x2).squeeze(1)
-    q_loss = 0.5 * ((critics(x, a) - q_target) ** 2).mean(1).sum()
-    a_new, log_prob = actor(x)
-    a_leaf = a_new.detach().requires_grad_()
-    q_new = critics(x, a_leaf).min(0).values
-    # the trap: a plain backward through q_new would also train the critics to please the actor, and cost another pass
-    slope, = torch.autograd.grad(q_new.sum(), a_leaf)
-    actor_loss = (TEMPERATURE * log_prob - (slope * a_new).sum(1)).mean()
-    v_loss = 0.5 * ((value(x).squeeze(1) - (q_new - TEMPERATURE * log_prob).detach()) ** 2).mean()
-    return actor_loss, q_loss, v_loss
-
-
-# ---------------------------------------------------------------- measuring
-
-def make_robots(n):
-    return Robots(ant_spec() if ROBOT == "ant" else half_cheetah_spec(), n, THREADS)
-
-
-def grid():
-    """DESIGN's tracking grid. Ant: 5 speeds x DIRECTIONS in [-1.5, 1.5] (a full circle's ends are one direction), (n, 3);
-    Half-Cheetah: 8 speeds in [-1, 1] (Fig 16), (8, 2). DADS: 5 x 5 in its square; SeCTAR, of eight axes: 25 fixed draws from the prior."""
-    if METHOD != "wedis":
-        return (torch.cartesian_prod(*[torch.linspace(-1, 1, 5)] * 2) if METHOD == "dads" else
-                torch.randn(25, AXES, generator=torch.Generator().manual_seed(0)))
-    if ROBOT != "ant":
-        return nn.functional.pad(torch.linspace(-1, 1, 9)[torch.arange(9) != 4][:, None], (0, 1))
-    directions = torch.linspace(-1.5, 1.5, DIRECTIONS) if EXPERIMENT != "ant_full" else 3 * torch.arange(DIRECTIONS) / DIRECTIONS - 1.5
-    return nn.functional.pad(torch.cartesian_prod(torch.linspace(-1.5, 1.5, 5), directions), (0, 1))
-
-
-def walk(actor, z, steps, hold, weight, deterministic=True, noise=None, run_in=0):
-    """Skills z (n, M) executed: all poses (n, steps * hold + 1, nq). From rest, or with noise, a generator, from noisy starts; recorded after
-    a run-in (from rest the first step is short and looks like acceleration)."""
-    robots = make_robots(len(z))
-    if noise is not None:
-        robots.reset(np.arange(len(z)), noise)
-    for _ in execute(actor, robots, z, 1, run_in, weight, deterministic):
-        pass
-    return np.stack([robots.qpos.copy(), *(robots.qpos.copy() for _ in execute(actor, robots, z, steps, hold, weight, deterministic))], 1)
-
-
-def paths(*skills, **how):
-    """The places of walk, (n, steps * hold + 1, 2 or 1) in metres."""
-    return walk(*skills, **how)[..., :2 if ROBOT == "ant" else 1]
-
-
-def grid_run(actor, decoder, deterministic=True):
-    """The tracking grid walked from rest for LENGTH skills' steps T of HOLD steps H_z. Returns executed and predicted end points (n, 2 or
-    1) in metres, of the baselines from the shortest prediction to the longest, and which robots were ever upside down (n,)."""
-    z = grid()
-    poses = walk(actor, z, LENGTH, HOLD, 0.0 if METHOD == "wedis" else None, deterministic)
-    # the up-vector of the torso: its quaternion's x and y tell its height, 1 - 2 (x^2 + y^2); on a rail the pitch does
-    up = 1 - 2 * (poses[..., 4:6] ** 2).sum(2) if ROBOT == "ant" else np.cos(poses[..., 2])
-    predicted = (HOLD * STEP_SCALE * predict(decoder, z, LENGTH).sum(1)).double().numpy()
-    order = slice(None) if METHOD == "wedis" else np.argsort((predicted ** 2).sum(1))
-    return poses[order, -1, :predicted.shape[1]], predicted[order], (up < 0).any(1)
-
-
-def tracking(executed, predicted):
-    """Tracking error RMS(executed - predicted) / RMS(predicted). By speeds (Ant: five; Half-Cheetah: four sizes, both signs averaged), mean
-    |direction error| in degrees (backwards is 180) and mean achieved / commanded distance along the commanded direction."""
-    error = np.sqrt(((executed - predicted) ** 2).sum(1).mean() / (predicted ** 2).sum(1).mean())
-    ratio = (executed * predicted).sum(1) / (predicted ** 2).sum(1)
-    e, p = (v @ np.array([[1], [1j]])[:v.shape[1]] for v in (executed, predicted))
-    turn = abs(np.angle(e / p, deg=True)[:, 0])
-    if ROBOT != "ant":
-        return error, *((v[3::-1] + v[4:])[:, None].mean(1) / 2 for v in (turn, ratio))
-    return error, turn.reshape(5, -1).mean(1), ratio.reshape(5, -1).mean(1)
-
-
-def by_speed(values):
-    """Mean over the slow, the middle and the fast of what tracking returns by speed."""
-    n = (len(values) - 1) // 2
-    return [float(part.mean()) for part in np.split(values, [n, len(values) - n])]
-
-
-def traversal(axis, values):
-    """Skills with one axis at values, the others at 0; acceleration at z_speed = -1, because it is nothing where speed is."""
-    z = torch.zeros(len(values), AXES)
-    if ROBOT != "ant" and axis == 1:
-        z[:, 0] = -1
-    z[:, axis] = torch.as_tensor(values, dtype=torch.float32)
-    return z
-
-
-def calibrate_relation(decoder, steps=5):
-    """The weight of the relation function (Sec. 4.2.2, next_skill) from the decoder alone: single steps at the skills the function
-    visits against the steps of the decoder's free run, least squares over a grid of skills; the Ant's only where the headings
-    stay within what was trained. Returns the weight and a function weight -> RMS miss as a share of the RMS step."""
-    g = torch.linspace(-1.5, 1.5, 13)
-    z = torch.cartesian_prod(torch.tensor([0.0, 0.75, 1.5]), g, g) if ROBOT == "ant" else torch.cartesian_prod(g / 1.5, g)
-    free = predict(decoder, z, steps)
-    inside = torch.ones(len(z), dtype=torch.bool)
-    if EXPERIMENT == "ant_semi":
-        inside = (torch.atan2(free[..., 1], free[..., 0]).abs() < math.radians(65)).all(1)
-
-    def miss(weight):
-        apart = predict(decoder, z, steps, weight)[inside] - free[inside]
-        return (apart.square().mean() / free[inside].square().mean()).sqrt().item()
-
-    low, high = -1.0, 1.0
-    while high - low > 1e-4:  # golden section: the miss has one valley
-        a, b = low + 0.382 * (high - low), low + 0.618 * (high - low)
-        low, high = (low, b) if miss(a) < miss(b) else (a, high)
-    return round((low + high) / 2, 4), miss
-
-
-@torch.no_grad()
-def calibrate_steps(actor):
-    """Beyond the paper: the table (SPEEDS, ANGLES, 2) for actor.told with which the Ant makes on average the steps it is asked for.
-
-    What it misses, ahead and to the left of the step, by the step's speed and its angle from the torso, is added to what it is told, and
-    measured again, a little less each time (stochastic approximation). Episodes begin with noise; their first fifth is not counted."""
-    rng, told = np.random.default_rng(SEED + 1), torch.zeros(SPEEDS * ANGLES, 2)
-    for k in range(1, CALIBRATED + 1):
-        actor.told = told.view(SPEEDS, ANGLES, 2)
-        robots = make_robots(CALIBRATORS)
-        robots.reset(np.arange(CALIBRATORS), rng)
-        step = torch.polar(FASTEST * (torch.arange(CALIBRATORS) + 0.5) / CALIBRATORS, 2 * math.pi * torch.rand(CALIBRATORS))
-        asked, back = torch.view_as_real(step), torch.polar(torch.ones(CALIBRATORS), -step.angle())  # back: turns the step ahead
-        missed, visits = torch.zeros_like(told), torch.zeros(len(told))
-        for t in range(EPISODE):
-            s = robots.observe()
-            displacement, failed = robots.step(actor.follow(s, asked, True).numpy())
-            if t >= EPISODE // 5:
-                miss = torch.view_as_real((step - torch.view_as_complex(displacement) / STEP_SCALE) * back)
-                nodes, share = actor.nodes(s, asked)
-                share[failed] = 0  # an unstable step means nothing
-                missed.index_add_(0, nodes.flatten(), (share[..., None] * miss[:, None]).flatten(0, 1))
-                visits.index_add_(0, nodes.flatten(), share.flatten())
-        told = told + missed / (visits + SELDOM)[:, None] / k ** GAIN_DECAY
-    return told.view(SPEEDS, ANGLES, 2)
-
-
-def draw_skills(actor, decoder, weight, name, columns):
-    """Fig 5, 15, 16: predicted (top) and executed (bottom) skills; a column per (axis, values, T, H_z). In one dimension the
-    latent is on the y axis and time steps have colours."""
-    figure, axes = plt.subplots(2, len(columns), figsize=((3.2 if len(columns) < 5 else 2.4) * len(columns), 6.4))
-    for column, (title, axis, values, steps, hold) in enumerate(columns):
-        z = traversal(axis, values)
-        predicted = np.pad(hold * STEP_SCALE * predict(decoder, z, steps).numpy().cumsum(1), ((0, 0), (1, 0), (0, 0)))
-        executed = paths(actor, z, steps, hold, weight)
-        both = np.concatenate([predicted, executed], 1)
-        if both.shape[2] == 1:
-            for row, points in enumerate((predicted, executed[:, ::hold])):
-                for t, colour in enumerate(plt.get_cmap("plasma")(np.linspace(0, 0.85, steps + 1))):
-                    axes[row, column].plot(points[:, t, 0], values, ".", color=colour, label=f"t = {t}")
-                axes[row, column].set(ylabel=title, xlim=(both.min() - 1, both.max() + 1))
-        else:
-            colours = plt.get_cmap("twilight_shifted" if len(values) > 5 else common.TRAVERSAL_MAP)(np.linspace(0, 0.95, len(values)))
-            for i, value in enumerate(values):
-                colour = common.LATENT_COLOURS[value] if len(values) == 5 else colours[i]
-                axes[0, column].plot(*predicted[i].T, "o-", ms=3 if hold > 1 else 1, color=colour, label=f"{value:g}")
-                axes[1, column].plot(*executed[i].T, color=colour)
-                axes[1, column].plot(*executed[i, ::hold].T, "o", ms=3 if hold > 1 else 1, color=colour)
-            low, high = both.min((0, 1)), both.max((0, 1))
-            room = (high - low).max() / 8
-            for ax in axes[:, column]:  # one scale for both rows, or the eye is fooled
-                ax.set(xlim=(low[0] - room, high[0] + room), ylim=(min(-3 * room, low[1] - room), max(3 * room, high[1] + room)))
-                ax.set_aspect("equal")
-        axes[0, column].set(title=f"{title}, $H_z$ = {hold}, T = {steps}")
-        if len(values) != len(columns[-1][2]):  # not the latents that the legend of the figure names
-            axes[0, column].legend(title="latent", fontsize=7, loc="upper left", ncols=3, handlelength=1)
-        axes[1, column].set(xlabel="x (m)")
-    for row, text in enumerate(("predicted by the model", "executed by the robot")):
-        axes[row, 0].set_ylabel(text + "\n" + (axes[row, 0].get_ylabel() or "y (m)"))
-    last = axes[0, -1].get_legend_handles_labels()
-    figure.legend(*last, title="latent" if both.shape[2] == 2 else "time step", loc="outside right upper")
-    save_figure(figure, OUT, name)
-
-
-def write_curve(curve):
-    update_csv(Path(OUT) / "results" / f"learning_curve_{EXPERIMENT}_seed{SEED}.csv", curve, ())
-
-
-def draw_learning_curve():
-    """Tracking error and achieved speeds, of a baseline also its own metric, against the minutes of training; a line per seed."""
-    curves = [read_csv(path) for path in sorted((Path(OUT) / "results").glob(f"learning_curve_{EXPERIMENT}_seed*.csv"))]
-    own = "metric" in curves[0][0]
-    figure, axes = plt.subplots(1, 2 + own, figsize=(8 + 4 * own, 3))
-    for n, curve in enumerate(curves):
-        column = {name: [float(row[name]) for row in curve] for name in curve[0]}
-        for ax, names in zip(axes, (dict(tracking_error=common.BLUE), dict(speed_slow=common.GREY, speed_mid=common.RED, speed_fast=common.BLUE),
-                                    dict(metric=common.BLUE))):
-            for name, colour in names.items():
-                ax.plot(column["minutes"], column[name], "-", lw=1.2, color=colour, label=name.removeprefix("speed_") if n == 0 else None)
-    for ax, label in zip(axes, (f"tracking error ({len(grid())} skills)", "achieved / commanded speed", f"{METHODS[METHOD].metric}, recent steps")):
-        ax.set(xlabel=f"minutes of training ({THREADS} thread{'s' * (THREADS > 1)}), {len(curves)} seed{'s' * (len(curves) > 1)}", ylabel=label)
-    for ax, (low, high, least, most) in zip(axes, ((0, 1.1, 0, 3), (-0.1, 1.3, -1, 3))):  # a baseline's first skills can be far off
-        ax.set_ylim(max(least, min(low, ax.get_ylim()[0])), min(most, max(high, ax.get_ylim()[1])))
-    axes[1].axhline(1, color="black", lw=0.8, ls="--")
-    axes[1].legend()
-    save_figure(figure, OUT, f"learning_curve_{EXPERIMENT}")
-
-
-def match(C):
-    """Best one-to-one matching of axes (A, rows) to factors (columns) by the cross-talk: the pairs whose purities sum to most. Of fewer
-    axes than factors some factors have none, of more each has its best. Returns {factor: (axis, purity)}, by number."""
-    share, n = C / C.sum(1, keepdims=True), min(C.shape)
-    axes, factors = max(((a, f) for a in permutations(range(len(C)), n) for f in combinations(range(C.shape[1]), n)),
-                        key=lambda pairing: share[pairing].sum())
-    return {f: (a, share[a, f]) for a, f in zip(axes, factors)}
-
-
-def measure_baseline(actor, policy, method, skills):
-    """What DADS and SeCTAR have beyond WEDIS's measures: {what: value}. skills (n, AXES), drawn from the prior."""
-    for name, part in method.model.items():
-        part.load_state_dict(policy[name])
-    found = dict(metric_first=policy["curve"][0]["metric"], metric_last=policy["curve"][-1]["metric"])
-    if METHOD == "dads":  # R^2: of what moves the robot, how much skill dynamics tell better than a constant
-        track = paths(actor, skills, 1, EPISODE, None)
-        for hold in (1, 20, HOLD):
-            executed = np.diff(track[:, ::hold], axis=1)
-            miss = executed - hold * STEP_SCALE * predict(method.decoder, skills, 1).numpy()
-            found[f"r2_of_{hold}_steps"] = 1 - (miss ** 2).sum() / ((executed - executed.mean((0, 1))) ** 2).sum()
-        return found
-    for name, mean_actions in (("", True), ("_sampled", False)):  # new trajectories from rest: the VAE has never seen them
-        track = paths(actor, skills, SKILL_STEPS, 1, None, mean_actions)
-        executed = torch.from_numpy(np.diff(track, axis=1)).float() / STEP_SCALE
-        found["reconstruction_error" + name] = method.reconstruction_error(executed)
-        miss = predict(method.decoder, skills, SKILL_STEPS).cumsum(1) - executed.cumsum(1)
-        found["self_consistency_error" + name] = (miss.square().mean() / executed.cumsum(1).square().mean()).sqrt().item()
-    if EXPLORE:
-        track = paths(actor, method.explorers(len(skills)), EPISODE, 1, None, False)
-        found["explorer_coverage_cells"] = cells(track)
-    return found
-
-
-def cells(track):
-    """How many cells of 1 m the paths (n, K, 2 or 1) in metres visit."""
-    return len(np.unique(np.floor(track.reshape(-1, track.shape[2])), axis=0))
-
-
-def draw_robots():
-    """Fig 14: both robots, rendered by MuJoCo off-screen."""
-    figure, axes = plt.subplots(1, 2, figsize=(8, 3.2))
-    for ax, title, spec in zip(axes, ("Ant", "Half-Cheetah"), (ant_spec(), half_cheetah_spec())):
-        model = spec.compile()
-        data, camera = mujoco.MjData(model), mujoco.MjvCamera()
-        data.qpos[:] = model.key_qpos[0] if model.nkey else model.qpos0
-        mujoco.mj_forward(model, data)
-        camera.lookat, camera.distance, camera.azimuth, camera.elevation = data.qpos[:3] if model.nkey else (0, 0, 0.5), 3, 120, -20
-        try:
-            renderer = mujoco.Renderer(model, 400, 500)
-        except Exception:  # no GL library, no device: the kinds differ by platform
-            print("no Fig 14: MuJoCo's renderer needs a GL library; install libegl1 (Debian, Ubuntu) or OSMesa with MUJOCO_GL=osmesa")
-            return plt.close(figure)
-        renderer.update_scene(data, camera)
-        ax.imshow(renderer.render())
-        ax.set(title=title, xticks=[], yticks=[])
-        ax.grid(False)
-    save_figure(figure, OUT, "fig14_robots")
-
-
-# ---------------------------------------------------------------- training
-
-def train(method, config):
-    """Algorithm 1, policy training, of any method. Returns what the policy artifact holds."""
-    rng = np.random.default_rng(SEED)
-    torch.manual_seed(SEED)
-    robots = make_robots(ROBOTS)
-    s_dim, a_dim, z_dim, span = robots.observe().shape[1], robots.ctrl.shape[1], method.z_dim, method.span
-    told = method.decoder if EGOCENTRIC and METHOD != "dads" else None
-    actor = Actor(s_dim - EGOCENTRIC, robots.place if told else z_dim, a_dim, HIDDEN, told, EGOCENTRIC)
-    n_in = actor.net[0].in_features
-    critics, value, target = Critics(n_in + a_dim), value_network(n_in), value_network(n_in).requires_grad_(False)
-    target.load_state_dict(value.state_dict())
-    average = copy.deepcopy(actor).requires_grad_(False)  # of the late weights: single ones swing from report to report
-    average.decoder = actor.decoder  # SeCTAR's learns
-    networks = nn.ModuleList([actor, critics, value, method.model])
-    optimizer = torch.optim.Adam(networks.parameters(), lr=LEARNING_RATE, fused=True)
-
-    columns = (s_dim, a_dim, s_dim, robots.place, z_dim)  # s, a, s', displacement, z; one row a step, so that one gather makes a batch
-    replay = torch.zeros(REPLAY // (ROBOTS * span) * ROBOTS * span, sum(columns))
-    moved = replay[:, -robots.place - z_dim:-z_dim]
-    z = method.sample(ROBOTS)
-    age = rng.integers(0, EPISODE, ROBOTS)  # staggered, or all robots would start anew at once
-    age -= age % span
-    updates = env_steps = unstable = 0
-    seconds, curve = 0.0, []
-    robots.reset(np.arange(ROBOTS), rng)
-
-    if resumable(OUT, "policy-checkpoint", EXPERIMENT, SEED, RESUME):
-        state = load(OUT, "policy-checkpoint", EXPERIMENT, SEED)
-        check_same(state, config, set(config) - {"RESUME", "OUT", "THREADS", "CHECKPOINT", "REPORTS", "UPDATES", "MINUTES"})
-        networks.load_state_dict(state["networks"])
-        target.load_state_dict(state["target"])
-        average.load_state_dict(state["average"])
-        optimizer.load_state_dict(state["optimizer"])
-        replay[:len(state["replay"])] = state["replay"]
-        z, age = state["z"], state["age"].numpy()
-        updates, env_steps, unstable, seconds, curve = (state[k] for k in ("updates", "env_steps", "unstable", "seconds", "curve"))
-        for name, view in state["robots"].items():
-            robots.batch.bind(name)[:] = view.numpy()
-        torch.set_rng_state(state["torch_rng"])
-        rng.bit_generator.state = state["numpy_rng"]
-
-    def checkpoint():
-        save(OUT, "policy-checkpoint", EXPERIMENT, SEED, config, networks=networks.state_dict(), target=target.state_dict(),
-             average=average.state_dict(), optimizer=optimizer.state_dict(), replay=replay[:env_steps].clone(), z=z, age=torch.from_numpy(age),
-             updates=updates, env_steps=env_steps, unstable=unstable, seconds=seconds, curve=curve, torch_rng=torch.get_rng_state(),
-             robots={k: torch.from_numpy(robots.batch.bind(k).copy()) for k in ("qpos", "qvel", "ctrl", "time", "qacc_warmstart")},
-             numpy_rng=rng.bit_generator.state)
-
-    def report():
-        own = {}
-        if method.metric:
-            with torch.no_grad(), torch.random.fork_rng():  # what is measured leaves the training as it is
-                rows = trajectories(500, span, env_steps, replay, RECENT)
-                own["metric"] = method.measure(moved[rows], replay[rows, -z_dim:])
-        error, degrees, ratio = tracking(*grid_run(average, method.decoder)[:2])
-        slow, mid, fast = by_speed(ratio)
-        curve.append(dict(updates=updates, env_steps=env_steps, minutes=seconds / 60, tracking_error=float(error), reward=r.mean().item(),
-                          direction_deg=float(degrees[2:].mean()), speed_slow=slow, speed_mid=mid, speed_fast=fast) | own)
-        write_curve(curve)
-        print(f"{updates:7d} updates {env_steps:8d} steps  tracking error {error:.3f}  direction {degrees[2:].mean():5.1f} deg  speed x "
-              f"{slow:.2f} {mid:.2f} {fast:.2f}  reward {r.mean():6.3f}  floor {floor:.3f}  "
-              + "".join(f"{method.metric} {v:.3f}  " for v in own.values()) +
-              f"{updates / seconds:4.0f} updates/s  {seconds / 60 * (1 / progress - 1):4.0f} min left", flush=True)
-
-    def share_done():
-        return seconds / 60 / MINUTES if MINUTES else updates / UPDATES
-
-    progress, last_save, interval = share_done(), time.time(), max(1, UPDATES // REPORTS)
-    while progress < 1:
-        clock, before = time.time(), updates
-        # Collect: one step of every robot
-        fresh = age % SKILL_STEPS == 0
-        z[fresh] = method.sample(int(fresh.sum()))  # Alg. 1: sample z_single from the prior
-        s = robots.observe()
-        if env_steps < WARM_UP:
-            a = torch.rand(ROBOTS, a_dim) * 2 - 1
-        else:
-            with torch.no_grad():
-                a = actor.act(s, z, t=int(age[0]) % span)
-        displacement, failed = robots.step(a.numpy())
-        rows = torch.arange(env_steps, env_steps + ROBOTS) % len(replay)
-        replay[rows] = torch.cat([s, a, robots.observe(), displacement, z], 1)
-        replay[rows[failed]] = replay[rows[failed] - ROBOTS]  # an unstable step means nothing: the one before is kept once more
-        env_steps += ROBOTS
-        unstable += int(failed.sum())
-        age += 1
-        if len(over := np.flatnonzero((age >= EPISODE) | failed)):
-            robots.reset(over, rng)
-            age %= EPISODE
-        if env_steps < WARM_UP:
-            seconds += time.time() - clock
-            continue
-        if not updates:  # state statistics of the random steps, kept from here on
-            first = replay[:env_steps, :s_dim]
-            if EGOCENTRIC:
-                with torch.no_grad():
-                    first, *_ = egocentric(first, actor.wanted(replay[:env_steps, -z_dim:]))
-            actor.s_mean.copy_(first.mean(0)), actor.s_std.copy_(first.std(0).clamp(min=1e-3))
-            average.load_state_dict(actor.state_dict())
-
-        # Improve: a few updates. What needs no gradient is computed for all of them at once
-        floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** min(1, max(0, (progress - 0.15) / 0.45))
-        for group in optimizer.param_groups:
-            group["lr"] = LEARNING_RATE * min(1, (1 - progress) / max(1 - DECAY_FROM, 1e-9))
-        s, a, _, displacement, skill = replay[trajectories(MODEL_BATCH, span, env_steps, replay, RECENT)].split(columns, 2)
-        model_loss = method.loss(s, a, displacement, skill, actor)
-        share = min(span, 2 * UPDATES_PER_STEP)  # steps of a trajectory in the batch, two in each update: decoded and relabelled once
-        rows = trajectories(UPDATES_PER_STEP * BATCH // share, span, env_steps, replay, len(replay))
-        t, skill = torch.randint(span, (share, len(rows))), replay[rows[:, 0], -z_dim:]
-        fresh = torch.rand(len(skill)) < RELABELLED
-        skill[fresh] = method.sample(int(fresh.sum()))  # a copy: replay keeps its own
-        s, a, s2, _, _ = replay[rows[torch.arange(len(rows)), t].flatten()].split(columns, 1)
-        with torch.no_grad():
-            r, step, after = method.reward(moved[rows], t, skill, floor)
-            skill = skill.repeat(share, 1)
-            x, turns = actor.inputs(s, skill, step)
-            x2, _ = actor.inputs(s2, skill, after)
-            a = actor.seen(a, turns)
-        for i, small in enumerate(zip(*(v.split(BATCH) for v in (x, a, x2, r)))):
-            losses = sac_losses(actor, critics, value, target, *small)
-            optimizer.zero_grad()
-            (sum(losses) + (model_loss if i == 0 else 0)).backward()  # SAC's three touch disjoint parameters
-            optimizer.step()
-            torch._foreach_lerp_(list(target.parameters()), list(value.parameters()), SMOOTHING)
-            torch._foreach_lerp_(list(average.net.parameters()), list(actor.net.parameters()), AVERAGED)
-            updates += 1
-        seconds += time.time() - clock
-        progress = share_done()
-
-        for name, metric in zip(("actor loss", "critic loss", "value loss", "model loss", "reward"), (*losses, model_loss, r.mean())):
-            if not math.isfinite(metric.item()):
-                stop(f"{name} is {metric.item()} after {updates} updates; nothing was overwritten: go on from the last good "
-                     f"{artifact_name('policy-checkpoint', EXPERIMENT, SEED)} with --resume true, or lower --learning_rate", code=1)
-        if updates // interval > before // interval or progress >= 1:
-            report()
-            if time.time() - last_save > 60 * CHECKPOINT:
-                checkpoint()
-                last_save = time.time()
-    checkpoint()
-    if unstable:
-        print(f"{unstable} steps were unstable in MuJoCo: those robots were reset, the steps thrown away")
-    parts = dict(actor=average, decoder=method.decoder) | dict(method.model.items())
-    return dict({name: part.state_dict() for name, part in parts.items()}, curve=curve, updates=updates, env_steps=env_steps, seconds=seconds)
-
-
-def take(decoder):
-    """What the policy artifact holds, without training: TAKEN's policy with another decoder in it. It knows wanted steps, not skills."""
-    content = load(OUT, "policy", TAKEN, SEED)
-    if "decoder.axes" not in content["actor"]:
-        stop(f"the policy of {TAKEN} is not egocentric and walks its own skills only; train instead, with --taken ''")
-    state = {name: value for name, value in content["actor"].items() if not name.startswith("decoder.")}
-    state |= {f"decoder.{name}": value for name, value in decoder.state_dict().items()}
-    return content | dict(actor=state, decoder=decoder.state_dict(), curve=[])
-
-
 if __name__ == "__main__":
-    config = parse_flags(globals())
-    torch.set_num_threads(THREADS)
-    if METHOD not in METHODS:
-        stop(f"unknown method {METHOD!r}; allowed: {' '.join(METHODS)}")
-    if METHOD == "wedis":
-        source = load(OUT, "wetvae", DECODER, DECODER_SEED)
-        decoder, names, ranges = load_decoder(source), source["names"], source["ranges"]
-        weight, miss = calibrate_relation(decoder)
-    else:
-        weight, names, ranges = None, list(FACTORS), list(FACTORS.values())
-    torch.manual_seed(SEED)
-    method = Wedis(decoder) if METHOD == "wedis" else METHODS[METHOD]()
-    if TRAIN:
-        least = max(BATCH, ROBOTS * method.span)
-        if not least <= WARM_UP <= REPLAY or not UPDATES or EPISODE % method.span or method.span > 1 and REPLAY < 2 * least:
-            more = f"; for {METHOD} --warm_up must be at least {least}, --replay {2 * least}, and --skill_steps divide --episode"
-            stop(f"--updates must be at least 1 and --warm_up {WARM_UP} must lie between --batch {BATCH} and --replay {REPLAY}"
-                 + more * (method.span > 1))
-        trained = take(decoder) if TAKEN else train(method, config)
-        if CALIBRATED and METHOD == "wedis" and EGOCENTRIC and not TAKEN:
-            torch.manual_seed(SEED)  # the same numbers however long was trained
-            trained["actor"]["told"] = calibrate_steps(load_actor(trained))
-        kept = {name: trained[name] for name in ("actor", "decoder", "encoder", "curve", "updates", "env_steps", "seconds") if name in trained}
-        save(OUT, "policy", EXPERIMENT, SEED, config, relation_weight=weight, **kept)
-    policy = load(OUT, "policy", EXPERIMENT, SEED)
-    check_same(policy, config, ("METHOD",))
-    actor, decoder = load_actor(policy), load_decoder(policy)
-
-    ant, values = ROBOT == "ant", np.linspace(-Z_RANGE, Z_RANGE, TRAVERSAL)
-    if METHOD == "wedis":
-        print(f"\nrelation function, calibrated: z_{names[1 if ant else 0]} {weight:+.3f} {'' if ant else 'sign(z_speed) '}z_{names[-1]}   "
-              f"(the paper, by hand: {0.2 if ant else 0.1} in size)")
-        print(f"  free run of the decoder missed by {miss(weight):.1%} RMS; with the paper's size by {miss(0.2 if ant else 0.1):.1%}, "
-              f"without by {miss(0.0):.1%}")
-        z = traversal(len(names) - 1, values)
-        predicted = 40 * STEP_SCALE * predict(decoder, z, 5).numpy().sum(1)
-        for w in (weight, 0.0):
-            away, size = (np.linalg.norm(v, axis=1).mean() for v in (paths(actor, z, 5, 40, w)[:, -1] - predicted, predicted))
-            print(f"  on the robot (T = 5, H_z = 40): weight {w:.3f} ends {away:.2f} m from the decoder's path of {size:.1f} m")
-
-    told, actor.told = actor.told, torch.zeros(0, 0, 2)
-    executed, commanded, flipped = grid_run(actor, decoder)
-    error_as_trained, *_, ratio = tracking(executed, commanded)
-    actor.told = told
-    print()
-    if told.numel():
-        print(f"as trained: tracking error {error_as_trained:.3f}, achieved/commanded {' '.join(f'{v:.2f}' for v in ratio)}; "
-              "with steps calibrated:")
-        executed, commanded, flipped = grid_run(actor, decoder)
-    error, degrees, ratio = tracking(executed, commanded)
-    torch.manual_seed(SEED)
-    error_sampled, *_ = tracking(*grid_run(actor, decoder, deterministic=False)[:2])
-    accelerating = "acceleration" in names
-    profiles = []
-    for i in range(AXES):  # the mean over noisy starts
-        track = paths(actor, traversal(i, values).repeat(STARTS, 1), 5, PROFILE, weight, noise=np.random.default_rng(SEED + 2), run_in=PROFILE)
-        profiles.append(np.diff(track[:, ::PROFILE], axis=1).reshape(STARTS, TRAVERSAL, 5, -1).mean(0) / (PROFILE * STEP_SCALE))
-    C, purity = cross_talk([factors_of(profile, accelerating) for profile in profiles], names, ranges)
-    if METHOD == "wedis":
-        skills = nn.functional.pad(torch.randn(COVERAGE, len(names) - 1), (0, 1))
-        purity = dict(zip(names, purity))
-    else:
-        skills = torch.rand(COVERAGE, AXES) * 2 - 1 if METHOD == "dads" else torch.randn(COVERAGE, AXES)
-        purity = {names[f]: p for f, (_, p) in match(C).items()}
-    coverage = cells(paths(actor, skills, LENGTH, HOLD if METHOD == "sectar" else EPISODE, None if weight is None else 0.0))
-    print(f"tracking error {error:.3f} (mean actions), {error_sampled:.3f} (sampled actions); flips {flipped.sum()} of {len(flipped)}")
-    print("from slow to fast")
-    print("direction error deg " + " ".join(f"{d:6.1f}" for d in degrees))
-    print("achieved/commanded  " + " ".join(f"{v:6.2f}" for v in ratio))
-    if accelerating:
-        promised = predict(decoder, traversal(1, values), 5).numpy()
-        print(f"accelerating skill: speed profile {np.sqrt(((profiles[1] - promised) ** 2).mean() / (promised ** 2).mean()):.3f} from the prediction")
-    print("executed cross-talk: " + "; ".join(f"z_{names[i] if METHOD == 'wedis' else i + 1} " + " ".join(f"{c:.2f}" for c in row)
-                                              for i, row in enumerate(C)) + "; purity " + " ".join(f"{n} {p:.2f}" for n, p in purity.items()))
-    print(f"coverage of {COVERAGE} random skills: {coverage} cells of 1 m")
-    if METHOD != "wedis":
-        extra = measure_baseline(actor, policy, method, skills)
-        print(f"{method.metric}: " + ", ".join(f"{what} {value:.3f}" for what, value in extra.items()))
-        rows = [dict(method=EXPERIMENT.removeprefix("ant_"), seed=SEED, what=what, value=value) for what, value in extra.items()]
-        update_csv(Path(OUT) / "results" / "baselines.csv", rows, ("method", "seed", "what"))
-    slow, mid, fast = by_speed(ratio)
-    update_csv(Path(OUT) / "results" / "policies.csv", [dict(
-        experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy["updates"], env_steps=policy["env_steps"],
-        train_minutes=policy["seconds"] / 60, tracking_error=error, tracking_error_sampled=error_sampled,
-        direction_error_deg=degrees[2:].mean(), speed_ratio_slow=slow, speed_ratio_mid=mid, speed_ratio_fast=fast, flips=int(flipped.sum()),
-        **{f"purity_{n}": purity.get(n, "") for n in ("speed", "direction", "curvature", "acceleration")},
-        coverage_cells=coverage, tracking_error_as_trained=error_as_trained)], ("experiment", "method", "seed"))
-    five, circle = list(common.LATENT_COLOURS), [round(float(v), 3) for v in grid()[:DIRECTIONS, 1]] if METHOD == "wedis" and ant else []
-    latents = [(f"$z_{i + 1}$", i, five, LENGTH, HOLD) for i in range(AXES)]
-    draw_skills(actor, decoder, weight, *{
-        "ant_semi": ("fig05_skills_wedis", [("$z_{speed}$", 0, five, 1, 100), ("$z_{dir}$", 1, five, 1, 100), ("$z_{cur}$", 2, five, 5, 40)]),
-        "ant_full": ("fig15_full_circle", [("$z_{speed}$", 0, five, 1, 100), ("$z_{dir}$", 1, circle, 1, 100)]),
-        "ant_dads": ("fig05_skills_dads", latents), "ant_sectar": ("fig05_skills_sectar", latents),
-        "ant_sectar_no_explorer": ("skills_sectar_no_explorer", latents),
-        "half_cheetah": ("fig16_half_cheetah", [("$z_{speed}$", 0, np.linspace(-1, 1, 9), 6, 20), ("$z_{acc}$", 1, np.linspace(-1, 1, 9), 6, 20)]),
-    }[EXPERIMENT])
-    if policy["curve"]:
-        write_curve(policy["curve"])
-        draw_learning_curve()
-    draw_robots()
+    main()

@@ -1,8 +1,8 @@
-"""What two or more of the four stages share, in the order a reader meets it:
-command line -> artifacts and CSV -> weak labels and factors -> decoder -> robot -> actor -> roll-outs -> plots.
+"""What two or more stages share, in the order in which a reader meets it:
+command line -> artifacts and CSV -> weak labels and factors -> decoder -> robot -> actor -> execution -> plots.
 
-Units: trajectory units for decoder displacements (one transition at most 1), metres and radians in the world,
-STEP_SCALE metres per trajectory unit for a robot, 0.05 s per environment step.
+Units: trajectory units for decoder displacements (one transition is at most 1), metres and radians in the world,
+`scale` metres per trajectory unit and environment step for a robot, 0.05 s per environment step.
 """
 import argparse
 import ast
@@ -17,11 +17,13 @@ import os
 import signal
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
-if sys.platform == "linux" and "MUJOCO_GL" not in os.environ:  # off-screen rendering; must be set before mujoco loads, and
-    os.environ["MUJOCO_GL"] = "egl" if ctypes.util.find_library("EGL") else "disable"  # the default, GLFW, aborts without a screen
+os.environ["MPLBACKEND"] = "Agg"  # figures are files; a notebook's backend would fail here
+if sys.platform == "linux" and "MUJOCO_GL" not in os.environ:  # set before mujoco loads: GLFW aborts without a screen
+    os.environ["MUJOCO_GL"] = "egl" if ctypes.util.find_library("EGL") else "disable"
 
-import matplotlib
+import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 import torch
@@ -30,14 +32,11 @@ from torch import nn
 
 try:
     import fcntl
-except ImportError:
+except ImportError:  # Windows
     fcntl = None
 
-matplotlib.use("Agg")  # figures are files; no window is ever opened
-import matplotlib.pyplot as plt  # noqa: E402
-
 HERE = Path(__file__).parent
-FORMAT = 2  # artifact format; raise it when what is stored changes meaning
+FORMAT = 3  # of the artifacts; raise it when the meaning of what is stored changes
 SCRIPT = {"dataset": "01_make_dataset.py", "wetvae": "02_train_wetvae.py", "policy": "03_train_policy.py"}
 
 
@@ -49,89 +48,100 @@ def stop(message, code=2):
     raise SystemExit(code)
 
 
+def convert(value, like, negative, name):
+    """value (text of a flag, or what a row of a table holds) -> the type of `like`. Exits with 2 if it does not fit."""
+    kind = type(like)
+    try:
+        if kind is bool:
+            result = {"true": True, "false": False}[str(value).lower()]
+        elif kind is tuple:
+            result = tuple(float(part) for part in (value.split() if isinstance(value, str) else value))
+            if len(result) != len(like) or not np.isfinite(result).all():
+                raise ValueError
+        elif kind in (int, float):
+            result = float(value)
+            if not math.isfinite(result) or (result < 0 and not negative):
+                raise ValueError
+            if kind is int:
+                result = int(result) if result.is_integer() else int("not whole")
+        else:
+            result = str(value)
+    except (KeyError, TypeError, ValueError):
+        wanted = {bool: "true or false", int: "a whole number", float: "a number", tuple: f"{len(like)} numbers"
+                  if kind is tuple else ""}[kind]
+        stop(f"{name} is {value!r}, but must be {wanted}{'' if negative or kind is bool else ', 0 or more'}")
+    return result
+
+
 def parse_flags(stage, argv=None):
-    """Make every `NAME = value  # comment` at the top of a stage a flag --name, and set the stage's globals from it.
+    """Make each `NAME = value  # comment` at the top of a stage a flag --name, and set the stage's globals from it.
 
-    stage: the script's globals(). A row of its EXPERIMENTS table overrides constants by name, flags override both.
-    Returns the configuration {NAME: value}. Exits with 2 and one line on an unknown flag, experiment or wrong type.
+    stage: the script's globals(). A row of its table EXPERIMENTS overrides constants by name; a flag overrides both.
+    Returns the configuration {NAME: value} and what flags alone say {NAME: value}. Exits with 2 and one line if a flag,
+    a row or a type is wrong, or if nothing can be written to OUT.
     """
-    if argv is None:  # a real command line: Ctrl-C and SIGTERM end with one line too
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
-        sys.excepthook = lambda kind, error, trace: (
-            print("\nstopped by hand; what was saved stays, and training goes on from its last checkpoint with --resume true", file=sys.stderr)
-            if kind is KeyboardInterrupt else sys.__excepthook__(kind, error, trace))
-    lines = Path(stage["__file__"]).read_text().splitlines()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if hasattr(signal, "SIGPIPE"):
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # piped into head: end as other programs do
+    sys.excepthook = one_line_when_stopped
+    source = Path(stage["__file__"]).read_text(encoding="utf-8")
+    lines = source.splitlines()
     comments = {}
-    for node in ast.parse("\n".join(lines)).body:
-        if isinstance(node, ast.Assign) and (name := getattr(node.targets[0], "id", "")).isupper():
-            if type(stage[name]) in (bool, int, float, str):
-                comments[name] = lines[node.end_lineno - 1].partition("  # ")[2]
-
-    def typed(kind):
-        def parse(text):
-            if kind is bool and text.lower() not in ("true", "false"):
-                raise ValueError
-            value = text.lower() == "true" if kind is bool else kind(text)
-            if kind in (int, float) and not 0 <= value < math.inf:
-                raise ValueError
-            return value
-        parse.__name__ = {bool: "true or false", int: "whole number, 0 or more", float: "number, 0 or more"}.get(kind, "text")
-        return parse
+    for node in ast.parse(source).body:
+        name = getattr(node.targets[0], "id", "") if isinstance(node, ast.Assign) else ""
+        if name.isupper() and type(stage[name]) in (bool, int, float, str, tuple):
+            comments[name] = lines[node.end_lineno - 1].partition("  # ")[2]
+            if "e" in ast.unparse(node.value) or "." not in ast.get_source_segment(source, node.value):
+                if isinstance(stage[name], float) and stage[name].is_integer():
+                    stage[name] = int(stage[name])  # 1e4 means ten thousand
+    rows = stage["EXPERIMENTS"]
+    negative = {name: isinstance(stage[name], tuple) or any(
+        isinstance(value, (int, float)) and value < 0 for value in [stage[name], *(row.get(name) for row in rows.values())])
+        for name in comments}
 
     parser = argparse.ArgumentParser(description=stage["__doc__"], allow_abbrev=False,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.error = lambda message: stop(f"{message}; see --help")
     for name, comment in comments.items():
-        parser.add_argument("--" + name.lower(), dest=name, type=typed(type(stage[name])), metavar=type(stage[name]).__name__,
-                            help=f"{comment} [{stage[name]}]".replace("%", "%%"))
-    given, unknown = parser.parse_known_args(argv)
+        shown = " ".join(f"{part:g}" for part in stage[name]) if isinstance(stage[name], tuple) else stage[name]
+        parser.add_argument("--" + name.lower(), dest=name, metavar=type(stage[name]).__name__,
+                            help=f"{comment} [{shown}]".replace("%", "%%"))
+    parsed, unknown = parser.parse_known_args(argv)
     if unknown:
-        stop(f"unknown flag {unknown[0]}; allowed: {' '.join('--' + n.lower() for n in comments)}")
-    flags = {name: value for name, value in vars(given).items() if value is not None}
-    experiment = flags.get("EXPERIMENT", stage["EXPERIMENT"])
-    if experiment not in stage["EXPERIMENTS"]:
-        stop(f"unknown experiment {experiment!r}; allowed: {' '.join(stage['EXPERIMENTS'])}")
-    stage.update(stage["EXPERIMENTS"][experiment])
-    stage.update(flags)
-    return stage["EXPERIMENTS"][experiment] | {name: stage[name] for name in comments}
+        stop(f"unknown flag {unknown[0]}; allowed: {' '.join('--' + name.lower() for name in comments)}")
+    given = {name: convert(value, stage[name], negative[name], "--" + name.lower())
+             for name, value in vars(parsed).items() if value is not None}
+    experiment = given.get("EXPERIMENT", stage["EXPERIMENT"])
+    if experiment not in rows:
+        stop(f"unknown experiment {experiment!r}; allowed: {' '.join(rows)}")
+    for name, value in rows[experiment].items():
+        if name not in stage:
+            stop(f"the row {experiment!r} of EXPERIMENTS names {name}, which is no constant of this file")
+        if name in comments:
+            value = convert(value, stage[name], negative[name], f"{name} in the row {experiment!r} of EXPERIMENTS")
+        stage[name] = value
+    stage["EXPERIMENT"] = experiment
+    stage.update(given)
+    write_whole(Path(stage["OUT"]) / f".can_write_{os.getpid()}", b"").unlink()  # before any work is lost
+    return {name: stage[name] for name in comments}, given
+
+
+def one_line_when_stopped(kind, error, trace):
+    if kind is KeyboardInterrupt:
+        print("\nstopped; what was saved stays, and --resume true goes on from the last checkpoint", file=sys.stderr)
+    else:
+        sys.__excepthook__(kind, error, trace)
 
 
 # ---------------------------------------------------------------- artifacts and CSV
 
-def artifact_name(kind, experiment, seed):
-    return f"{kind}_{experiment}_seed{seed}" + (".npz" if kind == "dataset" else ".pt")
-
-
-def leaves(content):
-    """Every array and plain value in an artifact, depth first, keys sorted: what a checksum is taken of."""
-    if isinstance(content, dict):
-        content = [part for key in sorted(content, key=str) for part in (str(key), content[key])]
-    if isinstance(content, (list, tuple)):
-        for part in content:
-            yield from leaves(part)
-    else:
-        yield content.numpy() if isinstance(content, torch.Tensor) else content
-
-
-def checksum(content):
-    """SHA-256 over all of it but the entry "sha256": a changed byte that zip and torch let pass is noticed all the same."""
-    sha = hashlib.sha256()
-    for leaf in leaves({key: value for key, value in content.items() if key != "sha256"}):
-        if isinstance(leaf, np.ndarray):
-            sha.update(f"{leaf.dtype}{leaf.shape}".encode())
-            sha.update(np.ascontiguousarray(leaf).tobytes())
-        else:
-            sha.update(repr(leaf).encode() + b"\0")
-    return sha.hexdigest()
-
-
-def write_whole(path, write):
-    """write(file) to path, whole or not at all: a reader sees the old file or the new one, never half of one."""
-    partial = path.with_name(path.name + ".partial")
+def write_whole(path, data):
+    """Write bytes to path, whole or not at all, under a name that no other process uses. Returns the path."""
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(partial, "wb") as file:
-            write(file)
+            file.write(data)
             file.flush()
             os.fsync(file.fileno())  # on the disk before it takes the name: a power cut leaves no empty artifact
         os.replace(partial, path)  # atomic
@@ -139,136 +149,152 @@ def write_whole(path, write):
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
         stop(f"cannot write {path}: {error.strerror}; free the space or choose another place with --out", code=1)
-
-
-def save(out, kind, experiment, seed, config, **content):
-    """Write runs/<kind>_<experiment>_seed<seed>, whole or not at all. content: arrays (.npz) or tensors and plain values (.pt)."""
-    path = Path(out) / "runs" / artifact_name(kind, experiment, seed)
-    meta = dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed, config=config,
-                versions=dict(torch=str(torch.__version__), mujoco=mujoco.__version__, numpy=np.__version__))
-    meta["sha256"] = checksum(meta | content)
-    write_whole(path, lambda file: np.savez(file, meta=json.dumps(meta), **content) if kind == "dataset"
-                else torch.save(meta | content, file))
     return path
 
 
+def artifact_name(kind, experiment, seed):
+    return f"{kind}_{experiment}_seed{seed}" + (".npz" if kind == "dataset" else ".pt")
+
+
+def save(out, kind, experiment, seed, config, **content):
+    """Write <out>/<kind>_<experiment>_seed<seed>. content: arrays (.npz) or tensors and plain values (.pt).
+    The last 32 bytes are the SHA-256 of all bytes before them; numpy and torch read over them."""
+    meta = dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed, config=config,
+                versions=dict(torch=str(torch.__version__), mujoco=mujoco.__version__, numpy=np.__version__))
+    buffer = io.BytesIO()
+    if kind == "dataset":
+        np.savez(buffer, meta=json.dumps(meta), **content)
+    else:
+        torch.save(meta | content, buffer)
+    data = buffer.getvalue()
+    return write_whole(Path(out) / artifact_name(kind, experiment, seed), data + hashlib.sha256(data).digest())
+
+
 def load(out, kind, experiment, seed, quiet=False):
-    """Read an artifact from runs/, else pretrained/, and say which was taken. Exits with 2 and one line if it is not sound."""
+    """Read an artifact from <out>/, else pretrained/, and say which. Returns its content, with "sha256" (hex digits).
+    Exits with 2 and one line if it is missing, damaged, foreign or not finite."""
     name = artifact_name(kind, experiment, seed)
     make = f"make it with: python {SCRIPT[kind.partition('-')[0]]} --experiment {experiment} --seed {seed}"
-    path = next((p for p in (Path(out) / "runs" / name, HERE / "pretrained" / name) if p.exists()), None)
+    path = next((p for p in (Path(out) / name, HERE / "pretrained" / name) if p.exists()), None)
     if path is None:
-        stop(f"no {name} in runs/ or pretrained/; {make}")
+        stop(f"no {name} in {out}/ or pretrained/; {make}")
     try:
+        data = path.read_bytes()
+        sound = hashlib.sha256(data[:-32]).digest() == data[-32:]
         if kind == "dataset":
-            with np.load(path, allow_pickle=False) as file:
+            with np.load(io.BytesIO(data), allow_pickle=False) as file:
                 content = {key: file[key] for key in file.files}
             content |= json.loads(str(content.pop("meta")))
         else:
-            content = torch.load(path, weights_only=True)
+            content = torch.load(io.BytesIO(data[:-32]), weights_only=True)
         found = {key: content.get(key) for key in ("format", "kind", "experiment", "seed")}
-        sound = content.get("sha256") == checksum(content)
-        finite = all(np.isfinite(leaf).all() for leaf in leaves(content) if isinstance(leaf, np.ndarray) and leaf.dtype.kind == "f")
-    except Exception:  # numpy, zipfile, json and torch raise a dozen kinds on a damaged file; all mean the same to a reader
-        stop(f"{path} is not readable (truncated, damaged or not an artifact of this project); {make}")
-    for key, wanted in dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed).items():
-        if found[key] != wanted:
-            stop(f"{path} has {key} {found[key]!r} where {wanted!r} is needed; {make}")
+    except Exception:  # numpy, zipfile, json and torch raise a dozen kinds on a damaged file; all mean the same
+        stop(f"{path} is damaged or is no artifact of this project; {make}")
+    for key, needed in dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed).items():
+        if found[key] != needed:
+            stop(f"{path} has {key} {found[key]!r} where {needed!r} is needed; {make}")
     if not sound:
         stop(f"{path} is damaged (its checksum does not match); {make}")
-    if not finite:
+    if not all(np.isfinite(leaf).all() for leaf in numbers_in(content)):
         stop(f"{path} holds numbers that are not finite; {make}")
     if not quiet:
         print(f"using {path.relative_to(HERE) if path.is_relative_to(HERE) else path}")
-    return content
+    return content | dict(sha256=data[-32:].hex())
 
 
-def resumable(out, kind, experiment, seed, resume):
-    """Whether training is to go on from a checkpoint; one that was stopped before its first checkpoint begins anew."""
-    found = (Path(out) / "runs" / artifact_name(kind, experiment, seed)).exists()
-    if resume and not found:
-        print(f"no {artifact_name(kind, experiment, seed)} in runs/ yet: training from the beginning")
-    return resume and found
+def numbers_in(content):
+    """Every array of floating-point numbers in an artifact."""
+    if isinstance(content, dict):
+        content = list(content.values())
+    if isinstance(content, (list, tuple)):
+        for part in content:
+            yield from numbers_in(part)
+    elif isinstance(content, (np.ndarray, torch.Tensor)):
+        array = np.asarray(content)
+        if array.dtype.kind == "f":
+            yield array
 
 
-def check_same(artifact, config, names):
-    """Exit with 2 unless the artifact was made with today's value of each constant in names."""
-    for name in sorted(names):
-        if (old := artifact["config"].get(name)) != config[name]:
-            stop(f"{artifact_name(*(artifact[key] for key in ('kind', 'experiment', 'seed')))} was made with --{name.lower()} {old}, "
-                 f"not {config[name]}; give the same, or train anew")
+def check_same(artifact, config, free):
+    """Exit with 2 unless an artifact was made with today's value of each constant that is not named in free."""
+    for name in sorted(set(config) - set(free)):
+        if artifact["config"].get(name) != config[name]:
+            stop(f"{artifact['kind']} {artifact['experiment']} was made with {name} = {artifact['config'].get(name)}, not "
+                 f"{config[name]}: give the same, or train anew")
 
 
 @contextlib.contextmanager
 def locked(path):
     """One process at a time: seeds trained side by side write rows into one file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with open(path.with_name(path.name + ".lock"), "w") as file:
-        if fcntl:  # not on Windows: let only one process write there
+        if fcntl:
             fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
 
 def update_csv(path, rows, key):
-    """Write rows (dicts), replacing those in the file that agree with one of them on the columns in key."""
+    """Write rows (dicts), in place of those in the file that agree with one of them on the columns in key."""
     new = [{k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in row.items()} for row in rows]
-    ours = {tuple(row[k] for k in key) for row in new}
-    path.parent.mkdir(parents=True, exist_ok=True)
+    replaced = {tuple(row[k] for k in key) for row in new}
     with locked(path):
         old = read_csv(path) if path.exists() else []
         text = io.StringIO()
         writer = csv.DictWriter(text, list(new[0]), extrasaction="ignore", restval="", lineterminator="\n")
         writer.writeheader()
-        writer.writerows([row for row in old if tuple(row.get(k) for k in key) not in ours] + new)
-        write_whole(path, lambda file: file.write(text.getvalue().encode()))
+        writer.writerows([row for row in old if tuple(row.get(k) for k in key) not in replaced] + new)
+        write_whole(path, text.getvalue().encode())
 
 
 def read_csv(path):
-    with open(path, newline="") as file:
+    with open(path, newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
-
-
-def bootstrap_interval(values, draws=10_000):
-    """95 % bootstrap interval of the mean of values (n,): (low, high)."""
-    means = np.random.default_rng(0).choice(values, (draws, len(values))).mean(1)
-    return np.quantile(means, [0.025, 0.975])
 
 
 # ---------------------------------------------------------------- weak labels and factors
 
-LABEL_RULES = {  # weak label: (number of classes, class from the factors, counted from 0), App. A.1.1 and A.3.1
-    "speed": (4, lambda f: np.floor(f["speed"] / 0.25)),
-    "direction": (4, lambda f: np.floor((math.pi / 2 - f["direction"]) / (math.pi / 4))),  # from +90 degrees downwards
-    "curvature": (3, lambda f: np.select([f["curvature"] > 0, f["curvature"] < 0], [1, 2], 0)),  # straight, left, right
-    "angle": (4, lambda f: np.floor(f["direction"] % (2 * math.pi) / (math.pi / 2))),  # full circle, quarters from 0 degrees
-    "x": (4, lambda f: np.floor((f["speed"] * np.cos(f["direction"]) + 1) / 0.5)),
-    "y": (4, lambda f: np.floor((f["speed"] * np.sin(f["direction"]) + 1) / 0.5)),
-    "velocity": (4, lambda f: np.floor((f["speed"] + 1) / 0.5)),  # speed with a sign, one dimension
-    "acceleration": (3, lambda f: np.select([f["acceleration"] > 0, f["acceleration"] < 0], [1, 2], 0)),  # none, up, down
-}
+SINGLE = ("speed", "direction")          # factors of z_single, Sec. 4.2.2: they act in each transition
+MULTI = ("curvature", "acceleration")    # factors of z_multi: they act over several transitions
+CLASSES = dict(speed=4, direction=4, curvature=3, acceleration=3, x=4, y=4)  # of each weak label, App. A.1.1, A.3.1
 
 
-def weak_labels(factors, names):
-    """factors: dict name -> (N,). Returns (N, M) int64 classes counted from 0 (the paper counts from 1)."""
-    rules = [LABEL_RULES[name] for name in names]
-    return np.stack([np.clip(rule(factors), 0, classes - 1).astype(np.int64) for classes, rule in rules], axis=1)
+def weak_labels(factors, names, ranges):
+    """Weak labels, App. A.1.1, A.3.1 and Fig 9. factors: {name: (N,)}, ranges: {name: (low, high)}. Returns (N, M)
+    int64 classes, from 0 (the paper: from 1). Curvature and acceleration: none, positive, negative; the others: four
+    equal segments of their range, of direction from the left downwards."""
+    labels = []
+    for name in names:
+        if name in MULTI:
+            label = np.select([factors[name] > 0, factors[name] < 0], [1, 2], 0)
+        else:
+            low, high = ranges[name]
+            share = (factors[name] - low) / (high - low)
+            if name == "direction":
+                share = 1 - share
+            label = np.clip(np.floor(CLASSES[name] * share), 0, CLASSES[name] - 1)
+        labels.append(label.astype(np.int64))
+    return np.stack(labels, 1)
 
 
-def factors_of(displacement, accelerating=False):
-    """Factors of trajectories given by their transitions. displacement (N, T, 2 or 1) -> dict of (N,): speed in the unit of the
-    displacement (in one dimension with its sign), direction of the first transition in radians, curvature in radians per
-    transition, x and y of a mean transition. accelerating: speed is that of the first transition, and acceleration is what a
-    transition gains, over the speed (but never over less than 0.1, or standing still would be noise)."""
-    one_d, T = displacement.shape[2] == 1, displacement.shape[1]
-    size = displacement[..., 0] if one_d else np.linalg.norm(displacement, axis=-1)
-    found = dict(speed=size[:, 0] if accelerating else size.mean(1))
-    if accelerating and T > 1:
-        found["acceleration"] = (size[:, -1] - size[:, 0]) / (T - 1) * np.sign(size[:, 0]) / np.maximum(abs(size[:, 0]), 0.1)
-    if not one_d:
+def factors_of(displacement, names):
+    """The factors in names of trajectories, from their transitions: displacement (N, T, 2 or 1) -> {name: (N,)}.
+
+    Speed in the unit of the displacement (with a sign in one dimension), direction of the first transition in
+    radians, curvature in radians per transition, x and y of the mean transition, acceleration as a share of the
+    speed per transition (of 0.1 at least: standing still is noise); beside it, speed is that of the first one."""
+    steps = displacement.shape[1]
+    size = np.linalg.norm(displacement, axis=2) if displacement.shape[2] == 2 else displacement[..., 0]
+    found = dict(speed=size.mean(1))
+    if "acceleration" in names:
+        found["speed"] = size[:, 0]
+        gain = (size[:, -1] - size[:, 0]) / max(steps - 1, 1) * np.sign(size[:, 0])
+        found["acceleration"] = gain / np.maximum(abs(size[:, 0]), 0.1)
+    if displacement.shape[2] == 2:
         heading = np.arctan2(displacement[..., 1], displacement[..., 0])
         turn = (np.diff(heading, axis=1) + math.pi) % (2 * math.pi) - math.pi
-        found |= dict(direction=heading[:, 0], curvature=turn.mean(1) if T > 1 else np.zeros(len(turn)),
-                      x=displacement[..., 0].mean(1), y=displacement[..., 1].mean(1))
-    return found
+        found["direction"], found["curvature"] = heading[:, 0], turn.sum(1) / max(steps - 1, 1)
+        found["x"], found["y"] = displacement.mean(1).T
+    return {name: found[name] for name in names}
 
 
 def spread(values, name):
@@ -279,134 +305,140 @@ def spread(values, name):
     return 2 * math.pi - np.diff(angles, append=angles[0] + 2 * math.pi).max()
 
 
-def cross_talk(curves, names, ranges):
-    """C[i, j] = range of factor j while axis i is traversed / full range of factor j; purity_i = C[i, i] / sum_j C[i, j].
+def cross_talk(curves, ranges):
+    """C[i, j] = range of factor j while axis i is traversed / its range in the data, (axes, factors). curves: of each
+    axis the factors {name: (n,)} along its traversal; ranges: {name: (low, high)} of the data."""
+    return np.array([[spread(curve[name], name) / np.ptp(limits) for name, limits in ranges.items()]
+                     for curve in curves])
 
-    curves: one dict of factors per axis, in the order of names; ranges: the data's. Returns C (M, M), purity (M,). No encoder.
-    Axes whose factors are not known yet may be more or fewer than names: then only C means something."""
-    C = np.array([[spread(curve[name], name) / full for name, full in zip(names, ranges)] for curve in curves])
-    return C, np.diag(C) / C.sum(1)[:len(names)]
+
+def purity(C, i, j):
+    """Purity of axis i for factor j: C[i, j] / sum_k C[i, k]. A row below 0.1 is a dead axis: nan."""
+    return C[i, j] / C[i].sum() if C[i].max() >= 0.1 else math.nan
 
 
 # ---------------------------------------------------------------- the decoder: predictive model and reward
 
 class Decoder(nn.Module):
-    """p_theta(tau | z), Fig 1: an LSTM that reads z and its own last mean and gives a Gaussian over the next displacement.
+    """p_theta(tau | z), Fig 1: an LSTM that reads z and its own last mean, and gives a Gaussian over the next displacement.
 
     The trap: with the true last displacement as input, noise-free trajectories give their factors away after two steps,
-    z is not needed and stays entangled. So the decoder never sees the truth, in training either.
-    """
+    z is not needed and stays entangled. So the decoder never reads the truth, in training either.
+    circle: index of a latent that is an angle, of which -1.5 and 1.5 are the same; the LSTM reads its cosine and sine."""
 
-    def __init__(self, z_dim, x_dim=2, hidden=64, circle=False):
+    def __init__(self, z_dim, x_dim, hidden, circle=None):
         super().__init__()
-        self.cell = nn.LSTMCell(x_dim + z_dim + circle, hidden)
+        self.arguments = (z_dim, x_dim, hidden, circle)
+        self.x_dim, self.circle = x_dim, circle
+        self.cell = nn.LSTMCell(x_dim + z_dim + (circle is not None), hidden)
         self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2 * x_dim))
-        self.register_buffer("axes", torch.eye(z_dim, z_dim + circle))  # canonical z -> latents of training: a signed permutation
-        self.register_buffer("circle", torch.zeros(3 * circle))  # which axis the first two latents are the circle of, sign, offset
-
-    def latents(self, z):
-        """Canonical z (B, M) -> latents of training (B, M), or (B, M + 1) where direction is a point on a circle, z_dir = 1 a third of it."""
-        out = z @ self.axes
-        if len(self.circle):
-            angle = z[:, int(self.circle[0])] * self.circle[1] * (2 * math.pi / 3) + self.circle[2]
-            out = torch.cat([angle.cos()[:, None], angle.sin()[:, None], out[:, 2:]], 1)
-        return out
+        self.register_buffer("axes", torch.eye(z_dim))  # canonical z -> latents of training: a signed permutation
 
     def unroll(self, latents, steps):
-        """Latents of training (B, L) -> mean and log-variance of the displacements, (B, steps, x_dim) each, in trajectory units."""
-        state, outputs = None, []
-        mean = latents.new_zeros(len(latents), self.cell.input_size - latents.shape[1])
+        """Latents of training (B, M) -> mean and log-variance of the displacements, (B, steps, x_dim) each."""
+        read = latents
+        if self.circle is not None:
+            read = torch.cat([latents[:, :self.circle], on_circle(latents[:, self.circle]), latents[:, self.circle + 1:]], 1)
+        mean = latents.new_zeros(len(latents), self.x_dim)
+        state, means, log_vars = None, [], []
         for _ in range(steps):
-            state = self.cell(torch.cat([mean, latents], 1), state)
+            state = self.cell(torch.cat([mean, read], 1), state)
             mean, log_var = self.head(state[0]).chunk(2, 1)
-            outputs.append(torch.stack([mean, log_var]))
-        return torch.stack(outputs, 2).unbind(0)
+            means.append(mean)
+            log_vars.append(log_var)
+        return torch.stack(means, 1), torch.stack(log_vars, 1)
 
     def forward(self, z, steps):
-        """Canonical z (B, M) -> as unroll."""
-        return self.unroll(self.latents(z), steps)
+        """Canonical z (B, M): axis m is factor m, + is more of it -> as unroll."""
+        return self.unroll(z @ self.axes, steps)
+
+
+def on_circle(z):
+    """Angle latents (B,), of which 3 is a whole turn -> cosine and sine (B, 2)."""
+    return torch.stack([(z * 2 * math.pi / 3).cos(), (z * 2 * math.pi / 3).sin()], 1)
 
 
 class SkillDynamics(nn.Module):
-    """q_phi(displacement | z) of DADS: a mixture of Gaussians with identity covariance on normalised displacements. The x-y prior slices
-    the place away and nothing else of the state is left: it reads z alone. Displacements in trajectory units."""
+    """q_phi(displacement | z) of DADS: a mixture of Gaussians with unit covariance on normalised displacements. Without the
+    place nothing of the state is left for it to read, so it reads z alone. Displacements in trajectory units."""
 
     def __init__(self, z_dim=2, x_dim=2, hidden=512, components=4):
         super().__init__()
+        self.arguments, self.x_dim = (z_dim, x_dim, hidden, components), x_dim
         self.net = nn.Sequential(nn.Linear(z_dim, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
                                  nn.Linear(hidden, components * (1 + x_dim)))
-        for name, value in (("x_mean", torch.zeros(x_dim)), ("x_std", torch.ones(x_dim)), ("axes", torch.eye(z_dim))):  # axes: see Decoder
-            self.register_buffer(name, value)
+        self.register_buffer("x_mean", torch.zeros(x_dim))
+        self.register_buffer("x_std", torch.ones(x_dim))
 
     def mixture(self, z):
         """z (B, m) -> log weights (B, K) and means (B, K, x_dim), normalised."""
         logit, mean = self.net(z).view(len(z), -1, 1 + len(self.x_mean)).split([1, len(self.x_mean)], 2)
         return logit.squeeze(2).log_softmax(1), mean
 
-    def log_prob(self, x, log_weight, mean):
-        """log q of normalised x under a mixture: (B, x_dim) -> (B,), each under its own; (B, 1, x_dim) -> (B, L), each under all L."""
-        square = (x[..., None, :] - mean).square().sum(-1)
-        return (log_weight - 0.5 * square).logsumexp(-1) - 0.5 * x.shape[-1] * math.log(2 * math.pi)
-
     def forward(self, z, steps):
-        """As Decoder: the mean displacement, the same at every step, (B, steps, x_dim); no log-variance, it is a mixture's."""
+        """As Decoder: the mean displacement, the same at each step, (B, steps, x_dim); no log-variance, it is a mixture's."""
         log_weight, mean = self.mixture(z)
         mean = self.x_mean + self.x_std * (log_weight.exp()[..., None] * mean).sum(1)
         return mean[:, None].expand(-1, steps, -1), None
 
 
-def load_decoder(content):
-    """The predictive model of an artifact: the Decoder of WEDIS and SeCTAR or the SkillDynamics of DADS."""
-    state = content["decoder"]
-    if "x_std" in state:
-        last, x_dim = state["net.4.bias"], len(state["x_mean"])
-        dynamics = SkillDynamics(len(state["axes"]), x_dim, len(state["net.0.bias"]), len(last) // (1 + x_dim))
-        dynamics.load_state_dict(state)
-        return dynamics.requires_grad_(False)
-    decoder = Decoder(len(state["axes"]), len(state["head.2.bias"]) // 2, len(state["head.0.bias"]), len(state["circle"]) > 0)
-    decoder.load_state_dict(state)
-    return decoder.requires_grad_(False)
+def pack(module):
+    """A network as plain values and tensors, for an artifact; unpack makes it again."""
+    return dict(network=type(module).__name__, arguments=list(module.arguments), state=module.state_dict())
 
 
-def next_skill(z, weight):
-    """The relation functions, Sec. 6.1.2 and A.3.2. Ant, z (..., 3) = (speed, direction, curvature): f_dir(z_dir, z_cur) = z_dir + weight
-    z_cur; Half-Cheetah, z (..., 2) = (speed, acceleration): f_speed(z_speed, z_acc) = z_speed + weight sign(z_speed) z_acc. The
-    paper tunes the weight by hand; 03 calibrates it from the decoder."""
-    if z.shape[-1] == 2:
-        return torch.stack([z[..., 0] + weight * z[..., 0].sign() * z[..., 1], z[..., 1]], -1)
-    return torch.stack([z[..., 0], z[..., 1] + weight * z[..., 2], z[..., 2]], -1)
+def unpack(packed):
+    module = {one.__name__: one for one in (Decoder, SkillDynamics, Actor)}[packed["network"]](*packed["arguments"])
+    module.load_state_dict(packed["state"])
+    return module.requires_grad_(False)
 
 
-def single(z):
-    """z_single: speed and direction of (speed, direction, curvature), speed of (speed, acceleration)."""
-    return z[..., :z.shape[-1] - 1]
+def next_skill(z, names, relation):
+    """The relation functions f, Sec. 4.2.2, 6.1.2 and A.3.2: z (..., M) of one transition -> of the next.
+
+    names: the factor of each axis; relation: {factor of z_multi: weight}. The paper tunes the weights by hand (-0.2 and 0.1,
+    signs by the axes of its training); 03 calibrates them from the decoder."""
+    z = z.clone()
+    for factor, weight in relation.items():
+        change = weight * z[..., names.index(factor)]
+        if factor == "curvature":
+            z[..., names.index("direction")] += change  # f_dir
+        elif "direction" in names:
+            z[..., names.index("speed")] += change  # f_speed, two dimensions
+        else:
+            z[..., names.index("speed")] += change * z[..., names.index("speed")].sign()  # f_speed of App. A.3.2
+    return z
 
 
-def first_step(decoder, z):
-    """Mean and log-variance (B, x_dim) of the decoder's first step for z_single = z (B, m), z_multi = 0."""
-    return (v[:, 0] for v in decoder(nn.functional.pad(z, (0, len(decoder.axes) - z.shape[1])), 1))
+def first_step(decoder, z_single):
+    """Mean and log-variance (B, x_dim) of the decoder's first step for z = (z_single, 0): p_theta(s_1 | z), Sec. 6.1.2."""
+    z = nn.functional.pad(z_single, (0, len(decoder.axes) - z_single.shape[1]))
+    mean, log_var = decoder(z, 1)
+    return mean[:, 0], log_var[:, 0]
 
 
 @torch.no_grad()
-def predict(decoder, z, steps, weight=None):
-    """Displacements (B, T, x_dim), in trajectory units, that skills z (B, M) promise: the decoder's means.
+def commands_of(policy, z, steps):
+    """The commands of skills z (B, M): displacements (B, `steps`, c_dim) in trajectory units.
 
-    weight None: `steps` free steps of the decoder, as in the paper. Else its first step, `steps` times, with z moved by
-    the relation function in between: exactly what the policy will be told to do."""
-    if weight is None:
-        return decoder(z, steps)[0]
-    skills = [z]
-    for _ in range(steps - 1):
-        skills.append(next_skill(skills[-1], weight))
-    mean, _ = first_step(decoder, single(torch.stack(skills, 1)).flatten(0, 1))
-    return mean.view(len(z), steps, -1)
+    WEDIS: the decoder's first step for z_single, `steps` (T) times, with z_single changed by the relation functions in
+    between. SeCTAR: its decoder's T steps. DADS: z itself, whatever it means."""
+    if isinstance(policy.decoder, SkillDynamics):
+        return z[:, None].expand(-1, steps, -1)
+    if not policy.names:
+        return policy.decoder(z, steps)[0]
+    singles = []
+    for _ in range(steps):
+        singles.append(z[:, :sum(name in SINGLE for name in policy.names)])
+        z = next_skill(z, policy.names, policy.relation)
+    mean, _ = first_step(policy.decoder, torch.cat(singles))
+    return mean.view(steps, len(z), -1).transpose(0, 1)
 
 
 # ---------------------------------------------------------------- the robot
 
-FRAME_SKIP = 5       # physics steps of 0.01 s per environment step
-STEP_SCALE = 0.1     # metres per trajectory unit and environment step, Ant (App. A.1.3: mean / 10)
-REST = (0, 0, 0.55, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1)  # the pose the Ant's model file calls init_qpos
+FRAME_SKIP = 5  # physics steps of 0.01 s per environment step
+REST = (0, 0, 0.55, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1)  # the pose that the Ant's model file calls init_qpos
 
 
 def ant_spec():
@@ -421,12 +453,15 @@ def ant_spec():
     capsule = dict(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.08, 0, 0])
 
     world = spec.worldbody
-    world.add_light(pos=[0, 0, 1.3], dir=[0.2, 0.2, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, diffuse=[0.8, 0.8, 0.8])
+    world.add_light(pos=[0, 0, 1.3], dir=[0.2, 0.2, -1], diffuse=[0.8, 0.8, 0.8],
+                    type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     spec.visual.headlight.diffuse = [0.3, 0.3, 0.3]
-    spec.add_texture(name="tiles", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER, width=64, height=64,
-                     rgb1=[0.86, 0.89, 0.86], rgb2=[0.78, 0.82, 0.79])
-    spec.add_material(name="tiles", texrepeat=[0.5, 0.5], texuniform=True).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
-    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[40, 40, 40], conaffinity=1, material="tiles", rgba=[1, 1, 1, 1])
+    spec.add_texture(name="tiles", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+                     width=64, height=64, rgb1=[0.86, 0.89, 0.86], rgb2=[0.78, 0.82, 0.79])
+    tiles = spec.add_material(name="tiles", texrepeat=[0.5, 0.5], texuniform=True)
+    tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
+    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[40, 40, 40], conaffinity=1, material="tiles",
+                   rgba=[1, 1, 1, 1])
     torso = world.add_body(name="torso", pos=[0, 0, 0.75])
     torso.add_freejoint(name="root").margin = 0.01
     torso.add_geom(name="torso_geom", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.25, 0, 0])
@@ -452,173 +487,140 @@ def ant_spec():
 
 
 class Robots:
-    """n robots of one model that step together on threads; equal to a loop over mj_step (mujoco.batch). A robot that is free to move
-    has two coordinates of place, x and y; one on a rail only x."""
+    """n robots of one model that step together on threads; equal to a loop over mj_step (mujoco.batch). A robot that is
+    free in space has two coordinates of place, x and y; one on a rail has x alone."""
 
     def __init__(self, spec, n, threads=2):
         model = spec.compile()
-        self.batch, self.place = Batch(model, n, threads), 2 if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE else 1
+        self.batch = Batch(model, n, threads)
+        self.places = 2 if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE else 1
         self.rest = model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
         self.qpos, self.qvel, self.ctrl, self.time = map(self.batch.bind, ("qpos", "qvel", "ctrl", "time"))  # live views
         self.reset(np.arange(n))
 
     def reset(self, ids, rng=None, noise=0.1):
-        """Put robots ids at the origin in the rest pose; with rng add U(-noise, noise) to positions, N(0, noise) to velocities."""
+        """Put robots ids at the origin in the rest pose; with rng add U(-noise, noise) to positions, N(0, noise) to
+        velocities."""
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)  # also clears the solver's warm start
-        self.qpos[ids], self.time[ids] = self.rest, 1.0  # clocks start at 1 s, MuJoCo's own reset of an unstable simulation at 0
+        self.qpos[ids] = self.rest
+        self.time[ids] = 1.0  # clocks start at 1 s, MuJoCo's own reset of an unstable simulation at 0
         if rng is not None:
             self.qpos[ids] += rng.uniform(-noise, noise, (len(ids), self.qpos.shape[1]))
             self.qvel[ids] = rng.normal(0, noise, (len(ids), self.qvel.shape[1]))
 
+    def place(self):
+        """x and y, or x alone, in metres: (n, 2 or 1). Float32."""
+        return torch.from_numpy(self.qpos[:, :self.places].astype(np.float32))
+
+    def age(self):
+        """Environment steps since the last reset (n, 1). Float32."""
+        return torch.from_numpy((self.time.reshape(-1, 1) - 1.0).astype(np.float32)) / 0.05
+
     def observe(self):
-        """The policy's state, Ant (n, 27), Half-Cheetah (n, 17): qpos without the place, qvel. Float32."""
-        return torch.from_numpy(np.concatenate([self.qpos[:, self.place:], self.qvel], 1, dtype=np.float32, casting="same_kind"))
+        """The policy's state: qpos without the place (App. A.1.3), qvel. Ant (n, 27), Half-Cheetah (n, 17). Float32."""
+        return torch.from_numpy(np.concatenate([self.qpos[:, self.places:], self.qvel], 1).astype(np.float32))
+
+    def upside_down(self):
+        """Which robots have turned over (n,): the torso's z axis points down."""
+        if self.places == 2:
+            return (self.qpos[:, 4:6] ** 2).sum(1) > 0.5  # from its quaternion: 1 - 2 (x^2 + y^2) < 0
+        return np.cos(self.qpos[:, 2]) < 0
 
     def step(self, action):
-        """One environment step of 0.05 s. action (n, 8) in [-1, 1]. Returns displacement (n, 2 or 1) in metres and which
+        """One environment step of 0.05 s. action (n, nu) in [-1, 1]. Returns displacement (n, 2 or 1) in metres and which
         simulations MuJoCo found unstable (n,): it has reset those, so that their displacement means nothing."""
-        before, clock = self.qpos[:, :self.place].copy(), self.time.copy()
+        before, clock = self.qpos[:, :self.places].copy(), self.time.copy()
         self.ctrl[:] = action
         self.batch.step(nstep=FRAME_SKIP)
         unstable = (self.time <= clock).reshape(-1) | ~np.isfinite(self.qpos).all(1)
-        return torch.from_numpy((self.qpos[:, :self.place] - before).astype(np.float32)), unstable
+        return torch.from_numpy((self.qpos[:, :self.places] - before).astype(np.float32)), unstable
 
 
 # ---------------------------------------------------------------- the skill policy
 
-FASTEST = 0.85  # trajectory units: the longest step that a calibrated policy is told, a skill's of z_speed = 2
-EXPLORER = 3.0  # the last entry of the z that means "explore" to SeCTAR's policy: far from N(0, I), and no plan asks for it
-ANKLES = torch.tensor([1.0, -1.0, -1.0, 1.0])  # legs 1 2 3 4: which way a bent ankle counts
+def rotate(v, angle):
+    """Vectors (B, 2) turned counter-clockwise by angle (B,)."""
+    cos, sin = angle.cos(), angle.sin()
+    return torch.stack([cos * v[:, 0] - sin * v[:, 1], sin * v[:, 0] + cos * v[:, 1]], 1)
 
 
-def turn_legs(x, turns, signs):
-    """Hip and ankle values of four legs (B, 8), leg by leg counter-clockwise, as seen from a frame turned by `turns` quarter turns
-    (B,). signs (4,): of the ankles, in x's order of legs; frames turned back have all of them bent the positive way."""
-    legs = x.view(-1, 4, 2)[torch.arange(len(x))[:, None], (torch.arange(4) + turns[:, None]) % 4]
-    order = signs[(torch.arange(4) + turns[:, None]) % 4] * signs
-    return torch.stack([legs[..., 0], legs[..., 1] * order], -1).flatten(1)
-
-
-def egocentric(s, step):
-    """The world as the Ant sees it. s (B, 27) of Robots.observe, step (B, 2): the displacement the skill asks for.
-
-    Physics knows no north, and the Ant looks the same after a quarter turn: everything is turned into the frame of the torso's
-    heading, and that by quarter turns until the wanted step points ahead within 45 degrees. Returns the state (B, 26), the
-    step (B, 2) and the quarter turns (B,). What is learnt for one direction is so learnt for all."""
-    alpha, beta = torch.complex(s[:, 1], s[:, 4]), torch.complex(s[:, 2], s[:, 3])  # quaternion = alpha + beta i: heading, tilt
-    ahead = torch.polar(torch.ones(len(s)), -2 * alpha.angle())  # turns the world until the torso faces along x
-    turns = (torch.angle(torch.view_as_complex(step) * ahead) / (math.pi / 2)).round()
-    back = torch.polar(torch.ones(len(s)), -turns * (math.pi / 2))
-    turns = turns.long()
-    plane = torch.stack([torch.view_as_complex(step) * ahead * back, beta * torch.polar(torch.ones(len(s)), -alpha.angle()) * back,
-                         torch.complex(s[:, 13], s[:, 14]) * ahead * back,     # velocity: of the world
-                         torch.complex(s[:, 16], s[:, 17]) * back], 1)         # angular velocity: of the torso
-    step, *plane = torch.view_as_real(plane).unbind(1)
-    state = torch.cat([s[:, :1], alpha.abs()[:, None], *plane, s[:, 15:16], s[:, 18:19],
-                       turn_legs(s[:, 5:13], turns, ANKLES), turn_legs(s[:, 19:27], turns, ANKLES)], 1)
-    return state, step, turns
+def to_base_frame(s, c):
+    """State (B, 27) of Robots.observe and command (B, 2), turned by the torso's heading -> (B, 26), (B, 2). Physics knows no
+    north: what is learnt for one heading is learnt for all. Angular velocity is the torso's own already."""
+    half = torch.atan2(s[:, 4], s[:, 1])  # half the heading: the quaternion (w, 0, 0, z) of a turn about the vertical
+    upright = torch.hypot(s[:, 1], s[:, 4])[:, None]
+    tilt, velocity = rotate(s[:, 2:4], -half), rotate(s[:, 13:15], -2 * half)
+    return torch.cat([s[:, :1], upright, tilt, s[:, 5:13], velocity, s[:, 15:]], 1), rotate(c, -2 * half)
 
 
 class Actor(nn.Module):
-    """pi_psi(a | s, z_single): a Gaussian squashed by tanh, Sec. 4.2.2. Normalises the state by fixed statistics. With a decoder it is
-    egocentric: it sees the step that the decoder predicts for z instead of z, from the torso's heading. Turned without a decoder (DADS), it
-    takes z itself for a step."""
+    """pi_psi(a | s, c): a Gaussian squashed by tanh. c is the command: the displacement that the decoder predicts for
+    z_single, in trajectory units (the paper: z_single itself, Sec. 4.2.2)."""
 
-    def __init__(self, s_dim, z_dim, a_dim, hidden, decoder=None, turned=False):
+    def __init__(self, s_dim, c_dim, a_dim, hidden, base_frame):
         super().__init__()
-        self.decoder = decoder
-        self.register_buffer("turned", torch.tensor(turned or decoder is not None))
-        self.net = nn.Sequential(nn.Linear(s_dim + z_dim, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
+        self.arguments = (s_dim, c_dim, a_dim, hidden, base_frame)
+        self.base_frame = base_frame
+        s_dim -= base_frame  # a turned quaternion has no fourth number
+        self.net = nn.Sequential(nn.Linear(s_dim + c_dim, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
                                  nn.Linear(hidden, 2 * a_dim))
         self.register_buffer("s_mean", torch.zeros(s_dim))
         self.register_buffer("s_std", torch.ones(s_dim))
-        self.register_buffer("told", torch.zeros(0, 0, 2))  # calibrated by 03: by speed and angle of a wanted step, what to add to it
 
-    def inputs(self, s, z, step=None):
-        """s (B, n), z (B, m), step (B, 2): what z asks for, if it is known -> what the networks see (B, s_dim + z_dim) and by how
-        many quarter turns the legs are counted on (B,)."""
-        turns = torch.zeros(len(s), dtype=torch.int64)
-        if self.turned:
-            s, z, turns = egocentric(s, self.wanted(z) if step is None else step)
-        return torch.cat([((s - self.s_mean) / self.s_std).clamp(-10, 10), z], -1), turns
-
-    def wanted(self, z, t=0):
-        """The step (B, 2) that z asks for at transition t: always WEDIS's first (the relation function moves z), SeCTAR's t-th."""
-        if self.decoder is None:
-            return z
-        step = self.decoder(nn.functional.pad(z, (0, len(self.decoder.axes) - z.shape[1])), t + 1)[0][:, t]
-        return torch.where(z[:, -1:] == EXPLORER, z[:, :2], step)
+    def inputs(self, s, c):
+        """What all networks read, (B, n): state and command in the base frame, the state normalised."""
+        if self.base_frame:
+            s, c = to_base_frame(s, c)
+        return torch.cat([((s - self.s_mean) / self.s_std).clamp(-10, 10), c], 1)
 
     def forward(self, x, deterministic=False):
         """x of inputs -> action (B, a_dim) in (-1, 1), log-probability (B,)."""
-        mean, log_std = self.net(x).chunk(2, -1)
+        mean, log_std = self.net(x).chunk(2, 1)
         log_std = log_std.clamp(-5, 2)
         noise = torch.zeros_like(mean) if deterministic else torch.randn_like(mean)
         u = mean + log_std.exp() * noise
         # log pi(a) = log N(u) - sum log(1 - tanh(u)^2), the last in a form that does not overflow for large |u|
         log_prob = -0.5 * noise ** 2 - log_std - 0.5 * math.log(2 * math.pi)
         log_prob = log_prob - 2 * (math.log(2) - u - nn.functional.softplus(-2 * u))
-        return torch.tanh(u), log_prob.sum(-1)
+        return torch.tanh(u), log_prob.sum(1)
 
     @torch.no_grad()
-    def act(self, s, z, deterministic=False, t=0):
-        """The action (B, a_dim) for the robot's own motors."""
-        return self.follow(s, self.wanted(z, t), deterministic)
-
-    @torch.no_grad()
-    def follow(self, s, step, deterministic=False):
-        """As act, asked for a step (B, 2) instead of a skill."""
-        step = self.tell(s, step)
-        x, turns = self.inputs(s, step, step)
-        action, _ = self(x, deterministic)
-        return self.seen(action, -turns)
-
-    def tell(self, s, step):
-        """What to tell the policy for a step (B, 2) to be made: itself, unless 03 has calibrated that."""
-        if not len(self.told):
-            return step
-        nodes, share = self.nodes(s, step)
-        more = torch.view_as_complex((self.told.flatten(0, 1)[nodes] * share[..., None]).sum(1))  # ahead, and to the left of the step
-        step = torch.view_as_complex(step)
-        step = step + more * torch.polar(torch.ones(len(s)), step.angle())
-        return torch.view_as_real(step / (step.abs() / FASTEST).clamp(min=1))
-
-    def nodes(self, s, step):
-        """Between which four entries of told, flattened, a step (B, 2) lies, (B, 4), and their shares (B, 4): rows are speeds from 0 to
-        FASTEST, columns angles from the torso's heading, round a quarter turn, after which the Ant looks the same."""
-        rows, columns = self.told.shape[:2]
-        angle = torch.view_as_complex(step).angle() - 2 * torch.complex(s[:, 1], s[:, 4]).angle()  # see egocentric
-        row = (step.norm(dim=1) * (rows - 1) / FASTEST).clamp(max=rows - 1.001)
-        column = angle * 4 / (2 * math.pi) % 1 * columns
-        i, j, down, right = row.long(), column.long(), row.frac(), column.frac()
-        nodes = [k * columns + m % columns for k in (i, i + 1) for m in (j, j + 1)]
-        return torch.stack(nodes, 1), torch.stack([u * v for u in (1 - down, down) for v in (1 - right, right)], 1)
-
-    def seen(self, action, turns):
-        """Actions with legs counted on by quarter turns: of the motors -> of the networks; with -turns back again."""
-        return action if not self.turned else turn_legs(action, turns, ANKLES.roll(1))  # motors begin with leg 4
+    def act(self, s, c, deterministic=False):
+        """Action (B, a_dim) for state s (B, s_dim) and command c (B, c_dim)."""
+        return self(self.inputs(s, c), deterministic)[0]
 
 
-def load_actor(content):
-    state = content["actor"]
-    a_dim, hidden, s_dim = len(state["net.4.bias"]) // 2, len(state["net.0.bias"]), len(state["s_mean"])
-    decoder = load_decoder(content) if "decoder.axes" in state else None
-    actor = Actor(s_dim, state["net.0.weight"].shape[1] - s_dim, a_dim, hidden, decoder, bool(state["turned"]))
-    actor.told = state["told"].clone()  # its length is free
-    actor.load_state_dict(state)
-    return actor.requires_grad_(False)
+FEEDBACK = 0.1        # closed loop: share of the distance to the reference that is added to each command (the paper: 0)
+CORRECTION = 0.2      # at most so much, trajectory units
+FASTEST = 0.85        # no command is longer, trajectory units; the fastest transition that training asks for is 1
+SOFT_START = 40       # environment steps over which the longest command grows from 0.2 to FASTEST
 
 
-@torch.no_grad()
-def execute(actor, robots, z, steps, hold, weight, deterministic):
-    """Alg. 2, execution: hold z_single for `hold` (H_z) environment steps, move it by the relation function, `steps` (T) times.
-    z (n, M); weight None (DADS, SeCTAR): there is no relation function, the policy is told all of z and at which transition it is. Yields
-    after each environment step (for contacts, frames and stopping); the robots hold the state."""
-    for t in range(steps):
+def closed_loop(c, reference, robots, scale):
+    """The command for a robot that should be at reference (n, 2 or 1), metres, and go on by c (n, 2 or 1), trajectory units."""
+    correction = FEEDBACK * (reference - robots.place()) / scale
+    c = c + correction * (CORRECTION / correction.norm(dim=1, keepdim=True).clamp(min=CORRECTION))
+    longest = (0.2 + (FASTEST - 0.2) * robots.age() / SOFT_START).clamp(max=FASTEST)
+    return c * (longest / torch.maximum(c.norm(dim=1, keepdim=True), longest))
+
+
+def execute(policy, robots, commands, hold, closed, deterministic):
+    """Alg. 2, lines 13-19: hold each command for `hold` (H_z) environment steps. commands (n, T, c_dim) in trajectory units.
+    Yields what Robots.step returns, after each step (for contacts, frames and stopping)."""
+    reference = robots.place()
+    for c in commands.unbind(1):
         for _ in range(hold):
-            told, at = (z, t) if weight is None else (single(z), 0)
-            yield robots.step(actor.act(robots.observe(), told, deterministic, at).numpy())
-        z = z if weight is None else next_skill(z, weight)
+            asked = closed_loop(c, reference, robots, policy.scale) if closed else c
+            yield robots.step(policy.actor.act(robots.observe(), asked, deterministic).numpy())
+            if closed:
+                reference = reference + policy.scale * c
+
+
+def load_policy(out, experiment, seed, quiet=False):
+    """A policy artifact of 03 as a namespace: networks actor and decoder; method, robot, names (of the axes; [] for DADS and
+    SeCTAR), relation (weights of the relation functions), scale (metres per trajectory unit), and all else that it holds."""
+    content = load(out, "policy", experiment, seed, quiet)
+    return SimpleNamespace(**content | dict(actor=unpack(content["actor"]), decoder=unpack(content["decoder"])))
 
 
 # ---------------------------------------------------------------- plots
@@ -633,7 +635,8 @@ plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.righ
 
 
 def save_figure(figure, out, name):
-    path = Path(out) / "figures" / f"{name}.png"
-    write_whole(path, lambda file: figure.savefig(file, format="png"))
+    """Write <out>/figures/<name>.png."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
     plt.close(figure)
-    print(f"wrote figures/{path.name}")
+    print(f"wrote {write_whole(Path(out) / 'figures' / f'{name}.png', buffer.getvalue())}")

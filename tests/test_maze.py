@@ -1,45 +1,102 @@
-"""Stage 4: geometry against dense sampling, walls that touch, Algorithm 2 against loops, Table 2 against the paper, the command line."""
+"""Stage 4: geometry against dense sampling, Algorithm 2 against plain loops, rewards counted by hand, Table 2 and the
+claims, rows and flags, results that are resumed or not, the command line. All policies here are tiny and untrained."""
 from types import SimpleNamespace
 
+import claims
 import common
 import numpy as np
 import pytest
 import torch
 from conftest import cli
 
+COLUMNS = ("maze reward method mode look_ahead samples trial seed final_distance min_distance success contacts "
+           "path_length planning_ms policy_seed policy settings").split()
 
-def case(**changed):
-    return SimpleNamespace(**dict(reward="dense", prediction="decoder", objective="final", samples=200, look_ahead=0, options="") | changed)
+
+def make_policy(folder, experiment, seed=0, decoder=None, **changed):
+    """Save a tiny policy artifact and return it as stage 4 loads it."""
+    torch.manual_seed(seed)
+    decoder = decoder or common.Decoder(3, 2, 16)
+    content = dict(actor=common.pack(common.Actor(27, 2, 8, 8, True)), decoder=common.pack(decoder), method="wedis",
+                   robot="ant", names=["speed", "direction", "curvature"], relation=dict(curvature=0.3), scale=0.1)
+    common.save(folder, "policy", experiment, seed, {}, **content | changed)
+    return common.load_policy(folder, experiment, seed, quiet=True)
+
+
+@pytest.fixture(scope="session")
+def policies(tmp_path_factory):
+    """A folder with two policies of WEDIS, one of each baseline, and one of another robot."""
+    folder = tmp_path_factory.mktemp("policies")
+    for seed in (0, 1):
+        make_policy(folder, "ant_semi", seed)
+    baseline = dict(names=[], relation={})
+    make_policy(folder, "ant_dads", decoder=common.SkillDynamics(2, 2, 8), method="dads", **baseline)
+    make_policy(folder, "ant_sectar", decoder=common.Decoder(2, 2, 8), method="sectar", **baseline)
+    make_policy(folder, "half_cheetah", decoder=common.Decoder(2, 1, 8), robot="half_cheetah")
+    return folder
 
 
 @pytest.fixture
-def skills(s4):
-    """WEDIS in Maze 1 with an untrained decoder, made livelier so that its paths differ."""
-    torch.manual_seed(0)
-    s4.POOL = 4096
-    found = s4.Skills("wedis", "maze1")
-    found.decoder, found.weight, found.top = common.Decoder(3).requires_grad_(False), 0.3, torch.full((3,), 1.5)
-    found.decoder.head[2].weight *= 40
-    return found
+def out(policies, tmp_path):
+    for path in policies.glob("*.pt"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    return tmp_path
+
+
+@pytest.fixture
+def stage(s4, out, monkeypatch, capsys):
+    """Runs stage 4 in this process, small unless flags say else: stage(*flags) -> exit code, rows, stdout, stderr."""
+    monkeypatch.setattr(s4.common, "HERE", out / "nothing")  # what is shipped must not matter
+    small = dict(out=out, trials=2, samples=4, episode=200, pool=64, threads=1, draw="fig06")
+
+    def run(*flags, **changed):
+        given = {name: value for name, value in (small | changed).items() if value is not None}
+        monkeypatch.setattr("sys.argv", ["04_mpc_maze.py", *(
+            text for name, value in given.items() for text in ("--" + name, str(value))), *flags])
+        fresh = {name: value for name, value in vars(s4).items() if isinstance(value, (bool, int, float, str, tuple))}
+        s4.load_once.cache_clear()
+        s4.print_once.cache_clear()
+        code = 0
+        try:
+            s4.main()
+        except SystemExit as end:
+            code = end.code
+        experiment = s4.EXPERIMENT
+        vars(s4).update(fresh)
+        path = out / "results" / f"{experiment}.csv"
+        printed = capsys.readouterr()
+        rows = common.read_csv(path) if path.exists() else []
+        return SimpleNamespace(code=code, rows=rows, out=printed.out, err=printed.err)
+    return run
+
+
+def unit(s4, out, method="wedis", maze="maze1", **changed):
+    """A unit as run() gets it, in the mode `printed`, with the tiny policy of seed 0."""
+    config, _ = common.parse_flags(vars(s4), ["--out", str(out)])
+    u = s4.settings(method, maze, config, {})
+    return SimpleNamespace(**vars(u) | dict(mode="printed", policy_seed=0, settings="x", pool=256) | changed)
 
 
 # ---------------------------------------------------------------- geometry
 
 def test_distances_are_the_papers(s4):
     assert np.hypot(*np.subtract(s4.GOAL, s4.START)) == pytest.approx(26.8, abs=0.05)
-    assert sum(np.subtract(s4.GOAL, s4.START)) == 36  # A.1.4: the effective distance
+    assert sum(np.subtract(s4.GOAL, s4.START)) == 36  # App. A.1.4: the effective distance
 
 
-@pytest.mark.parametrize("maze, scale, n, length", [("maze1", 30, 500, 2), ("s_maze", 30, 500, 2), ("obstacles", 0.3, 500, 2), ("maze2", 2, 50, 45)])
-def test_collisions_agree_with_dense_sampling(s4, maze, scale, n, length):
+@pytest.mark.parametrize("maze, step, n, length", [("maze1", 30, 400, 2), ("s_maze", 30, 400, 2),
+                                                   ("obstacles", 0.3, 400, 2), ("maze2", 2, 40, 45)])
+def test_collisions_agree_with_dense_sampling(s4, maze, step, n, length):
     rng = np.random.default_rng(0)
-    path = rng.uniform([-8, -8], [33, 20], (n, 1, 2)) + np.pad(np.cumsum(rng.uniform(-scale, scale, (n, length, 2)), 1), ((0, 0), (1, 0), (0, 0)))
-    found = s4.collides(torch.from_numpy(path.astype(np.float32)), s4.MAZE[maze], 1.0).numpy()
+    path = np.pad(np.cumsum(rng.uniform(-step, step, (n, length, 2)), 1), ((0, 0), (1, 0), (0, 0)))
+    path += rng.uniform([-8, -8], [33, 20], (n, 1, 2))
+    found = s4.collides(torch.from_numpy(path.astype(np.float32)), s4.MAZE[maze]["WALLS"], 1.0).numpy()
     points = path[:, :-1, None] + np.linspace(0, 1, 1501)[:, None] * np.diff(path, axis=1)[:, :, None]
     hit = np.zeros((n, length), bool)
-    for x0, x1, y0, y1 in s4.MAZE[maze]:
+    for x0, x1, y0, y1 in s4.MAZE[maze]["WALLS"]:
         hit |= ((points >= (x0 - 1, y0 - 1)) & (points <= (x1 + 1, y1 + 1))).all(3).any(2)
-    assert (hit != found).sum() <= 2 and 0.05 < found.mean() < 0.95  # sampling misses a corner cut shorter than its step
+    assert (hit != found).sum() <= 2  # sampling misses a corner cut shorter than its step
+    assert 0.05 < found.mean() < 0.95
 
 
 def test_a_transition_that_stands_still_collides_where_it_stands(s4):
@@ -47,223 +104,395 @@ def test_a_transition_that_stands_still_collides_where_it_stands(s4):
     assert s4.collides(still, [(9, 10, -1, 1)], 0.5).flatten().tolist() == [False, True, False]
 
 
-def test_no_straight_line_but_some_path_solves_each_maze(s4):
+def test_no_straight_line_but_some_path_solves_each_maze(s4, out):
     ways = dict(maze1=[(0, 0), (19.5, 2), (24, 12)], maze2=[(0, 0), (6, 1), (10, 2), (15.2, 9.5), (19, 10), (24, 12)],
                 s_maze=[(0, 0), (9.5, 4), (28.5, -4), (38, 0)], obstacles=[(0, 0), (4, 5), (8, 7), (17, 8)])
     assert set(ways) == set(s4.MAZE)
     for maze, way in ways.items():
-        assert s4.collides(torch.tensor([[way[0], way[-1]]], dtype=torch.float32), s4.MAZE[maze], s4.RADIUS).any(), maze
-        assert not s4.collides(torch.tensor([way], dtype=torch.float32), s4.MAZE[maze], s4.RADIUS).any(), maze
+        u = unit(s4, out, maze=maze)
+        assert (way[0], way[-1]) == (u.start, u.goal)
+        straight, bent = (torch.tensor([w], dtype=torch.float32) for w in ([way[0], way[-1]], way))
+        assert s4.collides(straight, u.walls, s4.RADIUS).any(), maze
+        assert not s4.collides(bent, u.walls, s4.RADIUS).any(), maze
 
 
 def test_walls_stop_the_ant_and_the_sensor_feels_it(s4):
-    robots = common.Robots(s4.maze_spec([(1.2, 2.2, -5, 5)]), 2)
+    robots = common.Robots(s4.maze_spec(SimpleNamespace(walls=[(1.2, 2.2, -5, 5)], goal=(3.0, 0.0))), 2, 1)
     touch = robots.batch.bind("sensordata")
     robots.qpos[1, 0] = -20
     felt = np.zeros(2, bool)
     for _ in range(60):
-        robots.qvel[:, 0] = 1  # pushed along x, no faster than it walks
+        robots.qvel[:, 0] = 1  # pushed along x
         robots.step(np.zeros((2, 8)))
         felt |= touch[:, 0] > 0
     assert felt.tolist() == [True, False]
     assert robots.qpos[0, 0] < 1.2 and robots.qpos[1, 0] > -20 + 2
 
 
-# ---------------------------------------------------------------- what skills promise
+# ---------------------------------------------------------------- Algorithm 2
 
-def test_promised_paths_are_algorithm_2_line_by_line(s4, skills):
-    z, start = torch.randn(3, 2, 3), torch.tensor([1.0, -2.0])
-    path = s4.scaled_path(start, skills.promise(z.flatten(0, 1), "decoder").view(3, 10, 2))
-    for n in range(3):
-        state, expected = start.clone(), [start]
-        for j in range(2):
-            for delta in skills.decoder(z[n, j:j + 1], 5)[0][0]:
-                state = state + 0.1 * 40 * delta
-                expected.append(state)
-        torch.testing.assert_close(path[n], torch.stack(expected), atol=1e-5, rtol=1e-5)
+@pytest.fixture
+def lively(policies):
+    """A decoder whose paths differ, with its axes in another order than usual."""
+    torch.manual_seed(0)
+    decoder = common.Decoder(3, 2, 16).requires_grad_(False)
+    decoder.head[2].weight *= 20
+    return SimpleNamespace(decoder=decoder, names=["direction", "speed", "curvature"], relation=dict(curvature=0.3),
+                           scale=0.1, sha256="0" * 64)
+
+
+def test_skills_are_those_of_app_a14(s4, out, lively):
+    """U(-1.5, 1.5), of the speed U(0, 1.5), wherever its axis is."""
+    z, _ = s4.skill_pool(unit(s4, out, policy=lively, pool=4096))
+    assert z.shape == (4096, 3) and z.abs().max() <= 1.5
+    assert z[:, 1].min() >= 0 and z[:, [0, 2]].min(0).values.max() < -1.49
+    assert z.mean(0).tolist() == pytest.approx([0, 0.75, 0], abs=0.06)
+    z, _ = s4.skill_pool(unit(s4, out, policy=lively, pool=4096, fast_only=False))
+    assert z.min(0).values.max() < -1.49
+
+
+def test_printed_predicts_by_the_decoder_that_reads_its_own_mean(s4, out, lively):
+    z, delta = s4.skill_pool(unit(s4, out, policy=lively))
+    mean, state = torch.zeros(256, 2), None
+    for t in range(5):
+        state = lively.decoder.cell(torch.cat([mean, z], 1), state)
+        mean = lively.decoder.head(state[0])[:, :2]
+        torch.testing.assert_close(delta[:, t], mean)
+    assert delta.std() > 0.02
+
+
+def test_closed_loop_predicts_by_first_steps_and_the_relation_function(s4, out, policies):
+    policy = common.load_policy(policies, "ant_semi", 0, quiet=True)
+    z, delta = s4.skill_pool(unit(s4, out, policy=policy, mode="closed"))
+    for t in range(5):
+        single = torch.stack([z[:, 0], z[:, 1] + 0.3 * t * z[:, 2], torch.zeros(256)], 1)  # f_dir, t times
+        torch.testing.assert_close(delta[:, t], policy.decoder(single, 1)[0][:, 0], atol=1e-6, rtol=1e-4)
 
 
 def test_a_scaled_arc_has_its_closed_form(s4):
-    """Steps of length d that turn by a each end at d (1 - e^{iaK}) / (1 - e^{ia}): scaling by H_z scales the arc, and nothing else."""
-    for hold in (1, 40):
-        angle, k = 0.2, torch.arange(12)
-        delta = 0.1 * hold * torch.stack([torch.cos(angle * k), torch.sin(angle * k)], 1)[None]
-        end = s4.scaled_path(torch.tensor([3.0, 4.0]), delta)[0, -1]
-        closed = 3 + 4j + 0.1 * hold * (1 - np.exp(12j * angle)) / (1 - np.exp(1j * angle))
-        assert end.tolist() == pytest.approx([closed.real, closed.imag], rel=1e-5)
+    """Steps of length d that turn by a each end at d (1 - e^{iaK}) / (1 - e^{ia}); scaling stretches that by H_z."""
+    angle = 0.2 * torch.arange(12)
+    delta = torch.stack([torch.cos(angle), torch.sin(angle)], 1)[None]
+    for scale in (0.1, 4.0):
+        path = s4.scaled_path(torch.tensor([[[3.0, 4.0]]]), delta, scale)
+        end = 3 + 4j + scale * (1 - np.exp(12j * 0.2)) / (1 - np.exp(0.2j))
+        assert path.shape == (1, 12, 2) and path[0, -1].tolist() == pytest.approx([end.real, end.imag], rel=1e-5)
 
 
-@pytest.mark.parametrize("name", ["wedis", "wedis_s", "wedis_nts"])
-def test_the_table_of_first_steps_reads_like_the_decoder(s4, skills, name):
-    found = s4.Skills(name, "maze1")
-    found.decoder, found.weight, found.top = skills.decoder, skills.weight, skills.top
-    z = 1.5 * (2 * torch.rand(500, 3) - 1)
-    exact = 0.1 * found.hold * common.predict(skills.decoder, z, found.length, skills.weight)
-    assert exact.std() > 0.02 * found.hold
-    torch.testing.assert_close(found.promise(z, "relation"), exact, atol=2e-4 * found.hold, rtol=0)
+def test_rewards_are_those_of_sec_62(s4):
+    u = SimpleNamespace(goal=(10.0, 0.0), walls=[(20, 21, -5, 5), (4, 5, 2, 9)], radius=1.0, penalty=100.0, reward=5.0,
+                        epsilon=3.0)
+    path = torch.tensor([[[0.0, 0], [6, 0], [10, 4]],       # free, ends 4 m away
+                         [[0.0, 0], [6, 0], [12, 0]],       # free, ends 2 m away
+                         [[0.0, 0], [19, 0], [20, 0]],      # both transitions collide, ends 10 m away
+                         [[0.0, 3], [8, 3], [10, 1]]])      # one collides, ends 1 m away
+    assert s4.reward(path, u, "dense").tolist() == [-4, -2, -210, -101]
+    assert s4.reward(path, u, "sparse").tolist() == [0, 5, -200, -95]
 
 
-# ---------------------------------------------------------------- the planner
-
-@pytest.mark.parametrize("reward", ["dense", "sparse"])
-@pytest.mark.parametrize("objective", ["final", "sum"])
-def test_plan_is_the_best_of_its_samples(s4, skills, reward, objective):
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
+def test_plan_is_algorithm_2_in_plain_loops(s4, out, lively, kind):
+    u = unit(s4, out, policy=lively)
+    z, delta = pool = s4.skill_pool(u)
     start = torch.tensor([18.0, 6.0])
-    found, path = s4.plan(skills, case(reward=reward, objective=objective), start, 2, 5, None, torch.Generator().manual_seed(5))
-    pool, _ = skills.pool("decoder", False)
-    assert pool.abs().max() <= 1.5 and pool[:, 0].min() >= 0 and pool[:, 1:].min() < -1.49
-    z = pool[torch.randint(len(pool), (200, 2), generator=torch.Generator().manual_seed(5))]
-    scores = []
-    for candidate in z:
-        p = s4.scaled_path(start, torch.cat([0.1 * 40 * skills.decoder(skill[None], 5)[0][0] for skill in candidate])[None])
-        r = [-(q - torch.tensor(s4.GOAL)).norm() for q in p[0, 1:]]
-        r = [5.0 * (abs(v) < 5) for v in r] if reward == "sparse" else r
-        scores.append(float((r[-1] if objective == "final" else sum(r)) - 100 * s4.collides(p, s4.MAZE["maze1"], 1.0).sum()))
-    chosen = [i for i in range(200) if torch.equal(z[i], found)]
-    assert scores[chosen[0]] == pytest.approx(max(scores), abs=1e-3) and max(scores) > np.median(scores)
-    torch.testing.assert_close(path[-1], s4.scaled_path(start, skills.promise(found, "decoder").flatten(0, 1)[None])[0, -1])
+    torch.manual_seed(5)
+    first, path = s4.plan(u, kind, 200, 2, pool, start)
+    torch.manual_seed(5)
+    best, best_path, picked = -1e9, None, torch.randint(256, (200, 2))
+    for sequence in picked:
+        state, states = start, [start]
+        for skill in sequence:
+            for step in delta[skill]:
+                state = state + 0.1 * 40 * step
+                states.append(state)
+        r = -float((state - torch.tensor(u.goal)).norm())
+        if kind == "sparse":
+            r = 5.0 * (abs(r) < 5)
+        for a, b in zip(states, states[1:]):
+            r -= 100.0 * float(s4.collides(torch.stack([a, b])[None], u.walls, 1.0).any())
+        if r > best + 1e-4:
+            best, best_path, best_z = r, torch.stack(states), z[sequence[0]]
+    torch.testing.assert_close(first, best_z)
+    torch.testing.assert_close(path, best_path, atol=1e-4, rtol=1e-5)
+    assert path.untyped_storage().nbytes() == path.numel() * 4  # no view that keeps all N in memory
 
 
-def toy(s4, samples, planner, seed, warm=None):
-    """Plans through Maze 1 with skills that are exact arcs. Returns how far the plan ends from the goal (1000 if it hits a wall), how many
-    paths were rolled out, and the skills."""
-    def promise(z, _):
-        heading = 0.85 * z[:, 1:2] + 0.2 * z[:, 2:] * torch.arange(5)
-        return (1.7 + 1.1 * z[:, :1, None]) * torch.stack([heading.cos(), heading.sin()], -1)
-
-    s4.PLANNER, s4.POOL, rolled_out, score = planner, 4096, [], s4.score
-    s4.score = lambda path, *rest: rolled_out.append(len(path)) or score(path, *rest)
-    skills = s4.Skills("wedis", "maze1")
-    skills.top, skills.promise = torch.full((3,), 1.5), promise
-    z, path = s4.plan(skills, case(samples=samples), torch.zeros(2), 3, 5, warm, torch.Generator().manual_seed(seed))
-    s4.score = score
-    for kept in (z, path):  # not views that keep all N in memory
-        assert kept.untyped_storage().nbytes() == kept.numel() * kept.element_size()
-    hit = s4.collides(path[None], skills.walls, s4.RADIUS).any()
-    return 1000 if hit else float((path[-1] - torch.tensor(s4.GOAL)).norm()), sum(rolled_out), z
-
-
-def test_cem_ends_nearer_than_shooting_at_equal_roll_outs(s4):
-    runs = {planner: [toy(s4, 1003, planner, seed)[:2] for seed in range(12)] for planner in ("shooting", "cem")}
-    assert {used for results in runs.values() for _, used in results} == {1003}
-    near = {planner: np.mean([distance for distance, _ in results]) for planner, results in runs.items()}
-    assert near["cem"] < 0.5 * near["shooting"] < 5
+def test_modes_differ_in_actions_and_in_feedback(s4, out, monkeypatch):
+    policy, asked, spec = make_policy(out, "ant_semi"), [], []
+    execute = s4.execute
+    monkeypatch.setattr(s4, "execute", lambda p, robots, commands, hold, closed, deterministic: asked.append(
+        (commands.shape, hold, closed, deterministic)) or execute(p, robots, commands, hold, closed, deterministic))
+    monkeypatch.setattr(s4, "maze_spec", lambda u, make=s4.maze_spec: spec.append(u.walls) or make(u))
+    for mode in ("printed", "closed"):
+        u = unit(s4, out, policy=policy, mode=mode, trials=2, samples=[3], hold=4, episode=59, start=(1.0, -2.0))
+        rows, examples = s4.run(u)
+        assert len(rows) == 4 and [e.trial for e in examples] == [0, 1, 0, 1]
+        poses = examples[0].poses
+        assert poses.shape == (41, 15) and np.abs(poses[0, :2] - (1, -2)).max() < 0.11  # START puts the Ant there
+        assert [(step, path.shape) for step, path in examples[0].plans] == [(0, (11, 2)), (20, (6, 2))]  # H_P 3 -> 2, 1
+        distance = np.hypot(*(poses[:, :2] - s4.GOAL).T)
+        assert rows[0]["final_distance"] == pytest.approx(distance[-1])
+        assert rows[0]["min_distance"] == pytest.approx(distance.min()) and rows[0]["look_ahead"] == 40
+        np.testing.assert_array_equal(poses[0], examples[2].poses[0])  # cases share their starts, trials do not
+        assert (poses[0] != examples[1].poses[0]).any()
+    assert asked == [((4, 5, 2), 4, False, False)] * 2 + [((4, 5, 2), 4, True, True)] * 2
+    assert spec == [s4.MAZE["maze1"]["WALLS"]] * 2
 
 
-@pytest.mark.parametrize("planner", ["shooting", "cem"])
-def test_a_warm_start_is_never_made_worse(s4, planner):
-    good, _, z = toy(s4, 2000, "cem", 0)
-    assert toy(s4, 8, planner, 1)[0] > good
-    assert toy(s4, 8, planner, 1, warm=z)[0] <= good + 1e-4
+# ---------------------------------------------------------------- tables and intervals
 
-
-def test_options_of_the_score(s4):
-    goal, wall = (10.0, 0.0), [(20, 21, -5, 5)]
-    through = torch.tensor([[[0.0, 0.3], [6, 0.3], [14, 0.3], [22, 0.3]], [[0, 3], [6, 3], [14, 3], [14, 4]]])
-    score = lambda sparse=False: s4.score(through, wall, goal, sparse, "final")  # noqa: E731
-    ends = (through[:, -1] - torch.tensor(goal)).norm(dim=1)
-    torch.testing.assert_close(score(), -ends - torch.tensor([100.0, 0]))
-    s4.STOP_AT_GOAL = 1.0  # the first passes the goal at 0.3 m, between two planned states, before it comes to the wall
-    torch.testing.assert_close(score(), torch.tensor([-0.3, -ends[1]]))
-    assert score(True).tolist() == [5, 0]
-    s4.EPSILON, s4.TIE_BREAK = 6.0, True
-    torch.testing.assert_close(score(True), torch.tensor([5 - 0.3 / 6, 5 - ends[1] / 6]))
-    s4.STOP_AT_GOAL, s4.MARGIN = 0.0, 5.5  # the wall grown by 6.5 m begins at 13.5 m: two transitions of each are in it
-    torch.testing.assert_close(score(), -ends - torch.tensor([100.0, 0]) - 2)
-
-
-# ---------------------------------------------------------------- tables
-
-def test_table_2_is_the_papers(s4):
-    """H_E, H_z, T, steps a skill, H_P dense and sparse as printed; the ranges of App. A.1.4's text, which its table swaps for DADS and SeCTAR."""
-    printed = dict(sectar=(600, 1, 40, 40, 4, 15, 1.5, -1.5), dads=(300, 20, 1, 20, 4, 15, 1.0, -1.0), wedis_s=(600, 40, 1, 40, 4, 15, 1.5, 0),
-                   wedis_nts=(600, 1, 20, 20, 4, 30, 1.5, 0), wedis=(600, 40, 5, 200, 3, 3, 1.5, 0))
-    rows = s4.table2()
+def test_table_2_is_the_papers(s4, out):
+    """H_E, H_z, T, steps a skill, H_P dense and sparse as printed; ranges as in the text of App. A.1.4."""
+    printed = dict(sectar=(600, 1, 40, 40, 4, 15, 1.5, -1.5), dads=(300, 20, 1, 20, 4, 15, 1.0, -1.0),
+                   wedis_s=(600, 40, 1, 40, 4, 15, 1.5, 0), wedis_nts=(600, 1, 20, 20, 4, 30, 1.5, 0),
+                   wedis=(600, 40, 5, 200, 3, 3, 1.5, 0))
+    rows = claims.table2([unit(s4, out, name) for name in s4.METHODS])
     assert {row["method"]: tuple(row.values())[1:] for row in rows} == printed
-    for row in rows:  # App. A.1.4: sparse tasks are planned to the episode's end
+    for row in rows:  # App. A.1.4: sparse tasks are planned to the end of the episode
         assert row["skills_sparse"] == row["episode_steps"] // row["steps_per_skill"]
-    s, o = s4.Skills("wedis", "s_maze"), s4.Skills("wedis", "obstacles")  # Fig 18's caption
-    assert (s.length, s.hold, s.planned_dense) == (6, 50, 2) and (o.length, o.hold, o.planned_dense) == (5, 50, 1)
+    s, o = unit(s4, out, maze="s_maze"), unit(s4, out, maze="obstacles")  # the caption of Fig 18
+    assert (s.length, s.hold, s.planned_dense, o.length, o.hold, o.planned_dense) == (6, 50, 2, 5, 50, 1)
+
+
+def test_intervals_hold_policies_and_trials(s4):
+    """The variance of a hierarchical bootstrap is between-policy / P + within-policy / (P n), as in a plain formula."""
+    rng = np.random.default_rng(0)
+    values = rng.normal(0, 1, (4, 30)) + np.array([[0], [1], [5], [6]])
+    means = s4.resampled_means(values, rng)
+    assert means.mean() == pytest.approx(values.mean(), abs=0.05)
+    assert means.var() == pytest.approx(values.mean(1).var() / 4 + values.var(1).mean() / 120, rel=0.05)
+    one = s4.resampled_means(values[:1], rng)
+    assert one.var() == pytest.approx(values[0].var() / 30, rel=0.05)
+
+
+def test_values_are_grouped_by_policy(s4):
+    rows = [dict(maze=maze, policy_seed=str(seed), final_distance=f"{seed}.{trial}")
+            for trial in range(3) for seed in (1, 0) for maze in ("a", "b")]
+    found = s4.values_of(rows, "final_distance", maze="a")
+    assert found.tolist() == [[1.0, 1.1, 1.2], [0.0, 0.1, 0.2]]
+    assert not s4.values_of(rows, "final_distance", maze="c").size
 
 
 def test_claims_are_judged_by_the_interval_of_the_difference(s4):
     rng = np.random.default_rng(0)
-    rows = [dict(maze="maze1", reward="dense", method=method, prediction="relation", samples=samples, final_distance=str(d))
-            for method, samples, mean in (("wedis", "1000", 2), ("wedis", "100", 9), ("wedis_s", "1000", 9), ("wedis_nts", "1000", 5))
-            for d in rng.normal(mean, 1, 30)]
-    found = {(row["claim"].split()[-1], row["better"], row["worse"]): row for row in s4.claims(rows, "relation")
-             if (row["maze"], row["reward"]) == ("maze1", "dense")}
-    assert found["cases", "wedis", "wedis_s"]["verdict"] == found["cases", "wedis", "wedis_nts"]["verdict"] == "holds"
-    assert found["samples", "wedis", "wedis_s"]["verdict"] == "undecided"
-    assert found["samples", "wedis", "wedis_nts"]["verdict"] == found["WEDIS-NTS", "wedis_s", "wedis_nts"]["verdict"] == "does not hold"
-    assert found["DADS", "wedis_s", "dads"]["verdict"] == "no data"
-    row = found["cases", "wedis", "wedis_s"]
-    assert row["low"] < 7 < row["high"] and row["high"] - row["low"] == pytest.approx(4 * (2 / 30) ** 0.5, rel=0.25)  # of a normal
+    rows = [dict(maze="maze1", reward="dense", method=method, mode="printed", samples=samples, policy_seed=str(seed),
+                 final_distance=str(d))
+            for method, samples, mean in (("wedis", "1000", 2), ("wedis", "100", 9), ("wedis_s", "1000", 9),
+                                          ("wedis_nts", "1000", 5), ("sectar", "1000", 20))
+            for seed in range(2) for d in rng.normal(mean, 1, 30)]
+    found = claims.comparisons(rows, s4)
+    by = {(row["claim"].split()[-1], row["better"], row["worse"]): row for row in found}
+    assert by["cases", "wedis", "wedis_s"]["verdict"] == by["cases", "wedis", "wedis_nts"]["verdict"] == "holds"
+    assert by["samples", "wedis", "wedis_s"]["verdict"] == "undecided"
+    assert by["samples", "wedis", "wedis_nts"]["verdict"] == "does not hold"
+    assert by["WEDIS-NTS", "wedis_s", "wedis_nts"]["verdict"] == "does not hold"
+    assert not any("dads" in (row["better"], row["worse"]) for row in found)  # no rows, no verdict
+    row = by["cases", "wedis", "wedis_s"]
+    assert row["low"] < 7 < row["high"] and (row["better_policies"], row["trials"]) == (2, 30)
+    assert {row["claim"] for row in found if "sectar" in row.values()} == {"SeCTAR has poor performance"}  # counts once
+    lines = {line["claim"].split()[-1]: line for line in claims.counts(found)}
+    assert [lines["samples"][verdict] for verdict in claims.VERDICTS] == [0, 1, 1]
+    assert [lines["performance"][verdict] for verdict in claims.VERDICTS] == [3, 0, 0]
+
+
+# ---------------------------------------------------------------- rows and flags
+
+def test_flags_win_over_methods_over_mazes_over_the_file(s4, out):
+    config, _ = common.parse_flags(vars(s4), ["--out", str(out)])
+    s4.MAZE["mine"] = dict(WALLS=[], HOLD=30, LENGTH=4, GOAL=(1, 2), SAMPLES=7)
+    s4.METHODS["other"] = dict(HOLD=25)
+    u = s4.settings("other", "mine", config, dict(LENGTH=3))
+    assert (u.hold, u.length, u.goal, u.samples, u.episode, u.walls) == (25, 3, (1.0, 2.0), [7], 600, [])
+    assert s4.settings("other", "maze1", config, dict(HOLD=10)).hold == 10
+    assert s4.settings("wedis", "maze1", config, {}).hold == 40  # rows leave no trace
+
+
+def test_hold_is_a_flag_for_every_method(stage):
+    ends = {hold: [row["final_distance"] for row in stage(method="dads", hold=hold, mazes="maze1").rows]
+            for hold in (20, 60)}
+    assert len(ends[20]) == 4 and ends[20] != ends[60]
+
+
+@pytest.mark.parametrize("method", ["wedis", "wedis_s", "wedis_nts", "dads", "sectar"])
+def test_each_row_of_methods_runs(s4, stage, method):
+    assert method in s4.METHODS and len(s4.METHODS) == 5
+    done = stage(method=method, mazes="maze1", draw="fig03 fig08 fig17")
+    assert done.code == 0, done.err
+    assert {row["mode"] for row in done.rows} == ({"printed", "closed"} if method == "wedis" else {"printed"})
+
+
+@pytest.mark.parametrize("maze", ["maze1", "maze2", "s_maze", "obstacles"])
+def test_each_row_of_mazes_runs(s4, stage, maze):
+    assert maze in s4.MAZE and len(s4.MAZE) == 4
+    done = stage(mazes=maze, rewards="dense", modes="closed", episode=None, draw="fig06 fig18")
+    assert done.code == 0, done.err
+    row = done.rows[0]
+    steps = dict(s_maze=600, obstacles=250).get(maze, 600)
+    assert len(done.rows) == 2 and row["look_ahead"] == str(steps) and 0 < float(row["planning_ms"])
+
+
+@pytest.mark.parametrize("experiment", ["mazes", "figure7", "fig18", "matched"])
+def test_each_row_of_experiments_runs(s4, stage, experiment, out):
+    assert experiment in s4.EXPERIMENTS and len(s4.EXPERIMENTS) == 4
+    flags = dict(mazes="maze2", rewards="dense")
+    if experiment == "fig18":
+        flags = dict(episode=600)
+    if experiment in ("figure7", "matched"):
+        flags["samples"] = "2 4"
+    done = stage(experiment=experiment, draw=None, **flags)
+    assert done.code == 0, done.err
+    assert list(done.rows[0]) == COLUMNS
+    names = dict(mazes=["fig03_trajectory_scaling", "fig06_mazes", "fig17_more_examples"], figure7=["fig07_planning"],
+                 fig18=["fig18_s_maze_obstacles"], matched=[])[experiment]
+    assert sorted(path.stem for path in (out / "figures").glob("*.png")) == names
+    if experiment in ("figure7", "matched"):
+        policies = {(row["method"], row["policy_seed"]) for row in done.rows}
+        trained = {(method, seed) for method in ("wedis", "wedis_s", "wedis_nts") for seed in "01"}
+        assert policies == trained | {("dads", "0"), ("sectar", "0")}
+        assert "dads is left out: no policy_ant_dads_seed1.pt; make it with: python 03_train_policy.py" in done.out
+
+
+def test_matched_looks_equally_far_ahead(s4, out):
+    policy = make_policy(out, "ant_semi")
+    for method, ahead in (("wedis_s", [200, 600]), ("wedis", [200, 600])):
+        u = unit(s4, out, method, policy=policy, trials=1, samples=[2], look_ahead=[200, 600], rewards=["dense"])
+        assert [row["look_ahead"] for row in s4.run(u)[0]] == ahead
+
+
+def test_a_maze_of_the_readers_own_is_one_row(s4, stage, out):
+    s4.MAZE["mine"] = dict(WALLS=[(3, 4, -2, 2)], START=(1.0, 1.0), GOAL=(6.0, 1.0))
+    done = stage(mazes="mine", draw="fig03 fig06 fig08 fig17 gif")
+    assert done.code == 0, done.err
+    assert {row["maze"] for row in done.rows} == {"mine"} and "| mine | dense |" in done.out
+    assert abs(float(done.rows[0]["min_distance"]) - 5) < 2
+    assert (out / "figures" / "mine.gif").exists() or "no mine.gif" in done.out
+
+
+def test_a_deleted_maze_and_two_methods_draw_what_is_left(s4, stage):
+    del s4.MAZE["maze1"]
+    done = stage(mazes="maze2", method="wedis dads", draw="fig03 fig06 fig08 fig17")
+    assert done.code == 0 and "| maze2 | dense | wedis |" in done.out, done.err
+
+
+def test_goal_and_epsilon_are_flags(stage):
+    done = stage(mazes="maze1", goal="3 0.5", epsilon=2)
+    assert done.code == 0 and "less than 2 m" in done.out, done.err
+    assert all(float(row["min_distance"]) < 3.3 for row in done.rows)
+    assert all((float(row["final_distance"]) < 2) == (row["success"] == "1") for row in done.rows)
+
+
+# ---------------------------------------------------------------- results that are used again
+
+def test_only_what_was_made_with_the_same_settings_is_used_again(s4, stage, monkeypatch):
+    shown = []
+    monkeypatch.setitem(s4.DRAWINGS, "fig07", lambda rows, units, examples: shown.append(rows))
+    flags = dict(experiment="figure7", method="wedis", mazes="maze1", samples="2 4", rewards="dense", draw=None, hold=4,
+                 episode=40)
+    first = stage(**flags, policy_seeds="0 1")
+    assert first.code == 0 and len(shown[0]) == 2 * 2 * 2 * 2, first.err  # modes, policies, sizes, trials
+    again = stage(**flags, policy_seeds="0 1")
+    assert again.out.count("already") == 4 and again.rows == first.rows and shown[1] == shown[0]
+
+    for change in (dict(hold=8), dict(goal="20 0"), dict(trials=1), dict(seed=1), dict(samples="2")):
+        changed = stage(**flags | change, policy_seeds="0")
+        assert "already" not in changed.out, change
+        assert {row["settings"] for row in shown[-1]}.isdisjoint(row["settings"] for row in first.rows), change
+        assert {row["policy_seed"] for row in shown[-1]} == {"0"}  # another policy is not pooled into the figure
+        made = {(row["mode"], row["seed"], row["policy_seed"], row["settings"]) for row in changed.rows}
+        assert len(made) == len({unit[:3] for unit in made}), change  # no rows of older settings beside those
+    stage(**flags, policy_seeds="0")
+    monkeypatch.setattr(common, "FEEDBACK", 0.05)
+    assert "already" not in stage(**flags, policy_seeds="0").out
+    s4.MAZE["maze1"] = dict(WALLS=s4.HULL)
+    assert "already" not in stage(**flags, policy_seeds="0").out
+    assert "already" in stage(**flags, policy_seeds="0").out
+
+
+def test_another_policy_under_the_same_name_is_planned_anew(stage, out):
+    flags = dict(experiment="figure7", method="wedis", mazes="maze1", rewards="dense", policy_seeds="0", draw="fig06",
+                 samples=4, hold=4, episode=40)
+    assert stage(**flags).code == 0
+    make_policy(out, "ant_semi", relation=dict(curvature=0.1))
+    assert "already" not in stage(**flags).out
+
+
+def test_claims_and_table_2_are_made_of_present_rows(s4, stage, out, monkeypatch, capsys):
+    flags = dict(samples="100 1000", mazes="maze1", rewards="dense", episode=200, trials=2, pool=64, threads=1, out=out)
+    assert stage(**flags, experiment="figure7").code == 0
+    argv = [text for name, value in flags.items() for text in ("--" + name, str(value))]
+    monkeypatch.setattr("sys.argv", ["claims.py", *argv])
+    claims.main(s4)
+    found = common.read_csv(out / "results/claims.csv")
+    assert {row["verdict"] for row in found} <= set(claims.VERDICTS)
+    assert len([row for row in found if row["mode"] == "printed"]) == 3 + 3 + 2 + 1 + 4
+    assert len([row for row in found if row["mode"] == "closed"]) == 3 + 3 + 1
+    assert len(common.read_csv(out / "results/table2.csv")) == 5
+    monkeypatch.setattr("sys.argv", ["claims.py", *argv, "--goal", "20 0"])
+    with pytest.raises(SystemExit):
+        claims.main(s4)
+    assert "holds nothing to compare" in capsys.readouterr().err
 
 
 # ---------------------------------------------------------------- command line
 
-def test_command_line_prints_the_table_and_writes_everything(fork, tmp_path):
-    flags = ["--out", tmp_path, "--trials", 2, "--samples", 50]
-    done = fork("04_mpc_maze", *flags, "--episode", 200)
-    assert done.returncode == 0, done.stderr
-    rows = common.read_csv(tmp_path / "results/mazes.csv")
-    assert len(rows) == 2 * 2 * 2 * 2 and {row["maze"] for row in rows} == {"maze1", "maze2"}
-    assert all(float(row["min_distance"]) <= float(row["final_distance"]) for row in rows)
-    assert all(f"| {maze} | {reward} | {p} | final |" in done.stdout for maze in ("maze1", "maze2") for reward in ("dense", "sparse")
-               for p in ("relation", "decoder"))
-    for name in ("fig03_trajectory_scaling.png", "fig06_mazes.png", "fig08_mpc_examples.png", "fig17_more_examples.png", "maze1.gif", "maze2.gif"):
-        assert (tmp_path / "figures" / name).stat().st_size > 10_000
-    again = fork("04_mpc_maze", *flags, "--episode", 200, "--animate", "false")  # same seed, same numbers
-    assert again.returncode == 0
-    strip = lambda rs: [{k: v for k, v in r.items() if k != "planning_ms"} for r in rs]  # noqa: E731
-    assert strip(common.read_csv(tmp_path / "results/mazes.csv")) == strip(rows)
-
-
-def test_figure_7_goes_on_where_it_stopped(fork, tmp_path):
-    flags = ["--experiment", "figure7", "--out", tmp_path, "--trials", 2, "--sample_sizes", "3 10", "--mazes", "maze1", "--episode", 200,
-             "--rewards", "dense"]
-    done = fork("04_mpc_maze", *flags, "--method", "wedis dads")
-    assert done.returncode == 0, done.stderr
-    assert "dads is left out: no policy_ant_dads_seed0.pt; make it with: python 03_train_policy.py --experiment ant_dads --seed 0" in done.stdout \
-        or (common.HERE / "pretrained/policy_ant_dads_seed0.pt").exists()
-    rows = common.read_csv(tmp_path / "results/figure7.csv")
-    first = [row for row in rows if row["method"] == "wedis"]
-    assert len(first) == 2 * 2 * 2 and {row["look_ahead"] for row in first} == {"200"}  # no plan looks beyond the episode's end
-    assert (tmp_path / "figures/fig07_planning.png").stat().st_size > 10_000
-    assert len(common.read_csv(tmp_path / "results/claims.csv")) == 2 * 15 and len(common.read_csv(tmp_path / "results/table2.csv")) == 5
-    again = fork("04_mpc_maze", *flags, "--method", "wedis wedis_s")
-    assert again.returncode == 0 and "wedis in maze1 is in figure7.csv already" in again.stdout, again.stderr
-    rows = common.read_csv(tmp_path / "results/figure7.csv")
-    assert [row for row in rows if row["method"] == "wedis"] == first and {row["method"] for row in rows} >= {"wedis", "wedis_s"}
-
-
-def test_stopping_at_the_goal_ends_a_trial_where_it_was_nearest(fork, tmp_path):
-    flags = ["--experiment", "best", "--out", tmp_path, "--trials", 2, "--mazes", "maze1", "--rewards", "dense", "--sample_sizes", 100,
-             "--stop_at_goal", 40]  # everywhere is near: it stops as soon as it walks away
+def test_command_line_draws_everything_and_repeats_itself(fork, out):
+    flags = ["--out", out, "--trials", 2, "--samples", 20, "--pool", 512, "--episode", 200, "--threads", 1]
     done = fork("04_mpc_maze", *flags)
     assert done.returncode == 0, done.stderr
-    rows = common.read_csv(tmp_path / "results/best.csv")
-    assert len(rows) == 2 and all("planner=cem" in row["options"] and "stop_at_goal=40.0" in row["options"] for row in rows)
-    assert all(float(row["final_distance"]) - float(row["min_distance"]) < 0.3 for row in rows)
+    lines = done.stdout.splitlines()
+    assert [line for line in lines if line.startswith("| maze")][0] \
+        == "| maze | reward | as printed | success | closed loop | success |"
+    for maze in ("maze1", "maze2"):
+        for kind in ("dense", "sparse"):
+            assert sum(line.startswith(f"| {maze} | {kind} |") for line in lines) == 1
+    assert f"using {out / 'policy_ant_semi_seed0.pt'}" in lines
+    rows = common.read_csv(out / "results/mazes.csv")
+    assert len(rows) == 2 * 2 * 2 * 2 and list(rows[0]) == COLUMNS
+    assert all(float(row["min_distance"]) <= float(row["final_distance"]) for row in rows)
+    for name in ("fig03_trajectory_scaling", "fig06_mazes", "fig08_mpc_examples", "fig17_more_examples"):
+        assert (out / "figures" / f"{name}.png").stat().st_size > 10_000
+    for maze in ("maze1", "maze2"):
+        if f"no {maze}.gif" not in done.stdout:
+            assert 10_000 < (out / "figures" / f"{maze}.gif").stat().st_size < 1e6
+    assert fork("04_mpc_maze", *flags, "--draw", "fig06", "--mazes", "maze2").returncode == 0  # same seed, same numbers
+    again = common.read_csv(out / "results/mazes.csv")
+    assert [row | dict(planning_ms=0) for row in again] == [row | dict(planning_ms=0) for row in rows]  # maze1 stays
 
 
-def test_without_a_gl_library_the_gif_is_drawn_by_matplotlib(tmp_path):
-    done = cli("04_mpc_maze", "--out", tmp_path, "--trials", 1, "--samples", 5, "--episode", 200, "--mazes", "maze1", "--rewards", "dense",
-               "--predictions", "relation", MUJOCO_GL="disable")
-    assert done.returncode == 0 and "drawn by matplotlib" in done.stdout, done.stderr
-    assert (tmp_path / "figures/maze1.gif").stat().st_size > 10_000
+def test_without_a_gl_library_one_line_says_so(out):
+    done = cli("04_mpc_maze", "--out", out, "--trials", 1, "--samples", 2, "--pool", 64, "--episode", 200, "--draw", "gif",
+               "--threads", 1, "--mazes", "maze1", MUJOCO_GL="disable")
+    assert done.returncode == 0 and "no maze1.gif: MuJoCo's renderer finds no GL library" in done.stdout, done.stderr
 
 
 @pytest.mark.parametrize("flags, line", [
-    (["--method", "ppo"], "unknown method 'ppo'; allowed: wedis wedis_s wedis_nts dads sectar"),
-    (["--planner", "random"], "unknown planner 'random'; allowed: shooting cem"),
-    (["--experiment", "fig18", "--mazes", "maze1"], "unknown maze 'maze1'; allowed: s_maze obstacles"),
-    (["--sample_sizes", "10 0"], "--sample_sizes and --look_aheads are whole numbers above 0 with blanks between them")])
-def test_a_wrong_choice_gets_one_line(flags, line, tmp_path, monkeypatch, capsys):
-    import runpy
-    script = str(common.HERE / "04_mpc_maze.py")
-    monkeypatch.setattr("sys.argv", [script, "--out", str(tmp_path), *flags])
-    with pytest.raises(SystemExit) as end:
-        runpy.run_path(script, run_name="__main__")
-    assert (end.value.code, capsys.readouterr().err) == (2, f"04_mpc_maze.py: {line}\n")
+    (dict(method="ppo"), "unknown 'ppo' in --method; allowed: wedis wedis_s wedis_nts dads sectar"),
+    (dict(mazes="maze9"), "unknown 'maze9' in --mazes; allowed: maze1 maze2 s_maze obstacles"),
+    (dict(modes="open"), "unknown 'open' in --modes; allowed: printed closed"),
+    (dict(draw="fig99"), "unknown 'fig99' in --draw; allowed: "),
+    (dict(samples="10 0"), "unknown '0' in --samples; allowed: whole numbers from 1"),
+    (dict(policy_seeds="-1"), "unknown '-1' in --policy_seeds; allowed: whole numbers from 0"),
+    (dict(trials=0), "wedis in maze1: trials is 0, but must be at least 1"),
+    (dict(episode=100), "wedis in maze1: an episode has 100 steps, but one skill 200"),
+    (dict(policy_seeds="7"), "there is nothing to plan: choose --method, --mazes, --modes, --policy_seeds"),
+    (dict(policy="half_cheetah"), "there is nothing to plan: choose --method, --mazes, --modes, --policy_seeds"),
+    (dict(method="dads", modes="closed"), "there is nothing to plan: choose --method, --mazes, --modes, --policy_seeds")])
+def test_what_makes_no_sense_gets_one_line(stage, flags, line):
+    done = stage(**flags)
+    assert done.code == 2 and done.err.count("\n") == 1 and done.err.startswith(f"04_mpc_maze.py: {line}"), done.err
+
+
+@pytest.mark.parametrize("table, row, line", [
+    ("MAZE", dict(WALLS=[(1, 0, 0, 1)]), "each is (x0, x1, y0, y1) in metres"), ("MAZE", dict(HOLDS=3), "HOLDS in the row"),
+    ("METHODS", dict(HOLD="x"), "but must be a whole number"), ("METHODS", dict(OUT="x"), "OUT in the row")])
+def test_rows_that_make_no_sense_get_one_line(s4, stage, table, row, line):
+    getattr(s4, table)["mine"] = row
+    done = stage(**{dict(MAZE="mazes", METHODS="method")[table]: "mine"})
+    assert done.code == 2 and line in done.err and done.err.count("\n") == 1, done.err
+
+
+def test_a_policy_of_another_method_plans_with_a_note(stage):
+    done = stage(policy="ant_dads", mazes="maze1")
+    assert done.code == 0, done.err
+    assert "note: wedis plans with policy_ant_dads_seed0.pt, which is trained by dads" in done.out
+    assert "wedis closed loop is left out" in done.out and {row["mode"] for row in done.rows} == {"printed"}
