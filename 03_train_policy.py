@@ -1,8 +1,9 @@
-"""Stage 3: decoder -> skill policy pi(a | s, c), trained by SAC on single steps (Sec. 4.2, Algorithm 1, App. A.1.3).
+"""Stage 3: decoder -> skill policy pi(a | s, c), trained by SAC on single steps (Sec. 4.2, Alg. 1, A.1.3).
 
-Reads runs/wetvae_*.pt of stage 2. A skill z_single asks for a step: the decoder's first displacement, here called the
-command c. The reward is the decoder's log-likelihood of the step that the robot makes (Eq. 6). Writes
-runs/policy_<experiment>_seed<seed>.pt, Fig 5 (15, 16), the learning curve and a row of runs/results/policies.csv.
+Reads runs/wetvae_*.pt of stage 2. A skill z_single asks for a step: the decoder's first displacement, here
+called the command c. The reward is the decoder's log-likelihood of the step that the robot makes (Eq. 6).
+Writes runs/policy_<experiment>_seed<seed>.pt, Fig 5, 14 (15, 16), the learning curve and a row of
+runs/results/policies.csv.
 MINUTES
 """
 import copy
@@ -11,11 +12,12 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from itertools import permutations
 from pathlib import Path
+from types import SimpleNamespace
 
 import common  # before mujoco: it chooses how mujoco renders
-from common import (MULTI, SINGLE, Actor, Decoder, Robots, SkillDynamics, ant_spec, artifact_name, check_same, commands_of,
-                    cross_talk, execute, factors_of, first_step, load, load_policy, pack, parse_flags, plt, purity, read_csv,
-                    save, save_figure, stop, unpack, update_csv)
+from common import (MULTI, SINGLE, Actor, Decoder, Robots, SkillDynamics, ant_spec, artifact_name, check_same,
+                    commands_of, cross_talk, execute, factors_of, first_step, layers, load, load_policy, pack,
+                    parse_flags, plt, purity, read_csv, save, save_figure, stop, unpack, update_csv)
 import mujoco
 import numpy as np
 import torch
@@ -52,13 +54,13 @@ HIDDEN = 256             # width of the two hidden layers (the paper: 512)
 LEARNING_RATE = 1e-3     # Adam (the paper: 3e-4, fixed)
 DECAY_FROM = 0.5         # share of the updates after which the learning rate falls linearly to 0
 ACTOR_EVERY = 2          # actor and value network learn in each second update of the critics (the paper: 1)
-AVERAGED = 0.002         # rate of the running average of the actor's weights, which is the policy (the paper: 1)
+AVERAGED = 0.002         # rate of the running average of the actor's weights: the policy (the paper: 1)
 DISCOUNT_START = 0.95    # gamma of Eq. 1 at the start: a short horizon teaches tracking sooner
 DISCOUNT = 0.985         # and from the middle on: a long one teaches not to fall (the paper: 0.99)
 SMOOTHING = 0.01         # of the target value network, App. A.1.3
 REWARD_SCALE = 0.1       # of Eq. 6 (the paper: 1)
 TEMPERATURE = 0.003      # alpha, weight of the entropy (the paper: 0.01, which is 0.001 at our reward scale)
-FLOOR_START = 0.04       # metres, least standard deviation of the reward: a sharp one makes standing still a trap
+FLOOR_START = 0.04       # metres, least deviation of the reward: a sharp one makes standing still a trap
 FLOOR_END = 0.01         # shrinks to this between 0.15 and 0.6 of the updates: teaches the slow skills
 
 # Baselines only
@@ -84,52 +86,57 @@ SECTAR = dict(METHOD="sectar", Z_DIM=8, RECENT=512_000, MODEL_BATCH=128, REWARD_
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
     "ant_semi": dict(FIGURE="fig05_skills_wedis"),
     "ant_full": dict(DECODER="full_circle", DIRECTIONS=16, FIGURE="fig15_full_circle"),
-    "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, BASE_FRAME=False, Z_RANGE=1.0, UPDATES=60_000,
-                         MULTI_RUN=(6, 20), FIGURE="fig16_half_cheetah"),
+    "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, BASE_FRAME=False,
+                         Z_RANGE=1.0, UPDATES=60_000, MULTI_RUN=(6, 20), FIGURE="fig16_half_cheetah"),
     "ant_world_frame": dict(BASE_FRAME=False),  # the paper's networks: what the base frame is good for
     "ant_dads": dict(METHOD="dads", Z_RANGE=1.0, SKILL_STEPS=200, FIGURE="fig05_skills_dads"),
     "ant_sectar": SECTAR | dict(FIGURE="fig05_skills_sectar"),
     "ant_sectar_no_explorer": SECTAR | dict(EXPLORE=0.0),  # what the explorer is good for
 }
-MAY_DIFFER = ("OUT TRAIN RESUME THREADS CHECKPOINT REPORTS UPDATES DIRECTIONS Z_RANGE SINGLE_RUN MULTI_RUN TRAVERSAL NOISY "
-              "STARTS FIGURE").split()  # from a checkpoint's
+MAY_DIFFER = ("OUT TRAIN RESUME THREADS CHECKPOINT REPORTS UPDATES DIRECTIONS Z_RANGE SINGLE_RUN MULTI_RUN "
+              "TRAVERSAL NOISY STARTS FIGURE").split()  # from a checkpoint's
 
 
 # ---------------------------------------------------------------- SAC (Haarnoja et al. 2017), App. A.1.3
 
+def adam(parameters):
+    return torch.optim.Adam(parameters, lr=LEARNING_RATE, fused=True)
+
+
 class Critics(nn.Module):
-    """Q_1 and Q_2 as one stack of batched matrix products (one call instead of two). (B, n), (B, m) -> (2, B)."""
+    """Q_1 and Q_2 as one stack of batched matrix products (one call for both): (B, n), (B, m) -> (2, B)."""
 
     def __init__(self, n_in):
         super().__init__()
-        sizes = [n_in, HIDDEN, HIDDEN, 1]
-        layers = [[nn.Linear(a, b) for a, b in zip(sizes, sizes[1:])] for _ in range(2)]  # torch's own initialisation
-        self.weights = nn.ParameterList(torch.stack([one.weight.T, two.weight.T]).detach() for one, two in zip(*layers))
-        self.biases = nn.ParameterList(torch.stack([one.bias, two.bias])[:, None].detach() for one, two in zip(*layers))
+        networks = [layers(n_in, HIDDEN, 1)[::2] for _ in range(2)]  # torch's own initialisation
+        pairs = list(zip(*networks))
+        self.weights = nn.ParameterList(torch.stack([a.weight.T, b.weight.T]).detach() for a, b in pairs)
+        self.biases = nn.ParameterList(torch.stack([a.bias, b.bias])[:, None].detach() for a, b in pairs)
 
     def forward(self, x, a):
         h = torch.cat([x, a], 1).expand(2, -1, -1)
         h = torch.relu(torch.baddbmm(self.biases[0], h, self.weights[0]))
         h = torch.relu(torch.baddbmm(self.biases[1], h, self.weights[1]))
-        return (h * self.weights[2].mT).sum(2) + self.biases[2].squeeze(2)  # a product with one column is faster as a sum
+        return (h * self.weights[2].mT).sum(2) + self.biases[2].squeeze(2)  # a matrix product is slower here
 
 
 def value_network(n_in):
-    return nn.Sequential(nn.Linear(n_in, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, 1))
+    return layers(n_in, HIDDEN, 1)
 
 
 class Sac:
-    """Actor psi, twin critics, value network and its target network, with a fixed temperature; average: the policy that is
-    kept, a running average of the actor's weights (single ones swing from report to report)."""
+    """Actor psi, twin critics, value and target network, with a fixed temperature. average: the policy that
+    is kept, a running average of the actor's weights (single ones swing from report to report)."""
 
     def __init__(self, s_dim, c_dim, a_dim):
         self.actor = Actor(s_dim, c_dim, a_dim, HIDDEN, BASE_FRAME)
         n_in = self.actor.net[0].in_features
-        self.critics, self.value = Critics(n_in + a_dim), value_network(n_in)
+        self.critics = Critics(n_in + a_dim)
+        self.value = value_network(n_in)
         self.target = copy.deepcopy(self.value).requires_grad_(False)
         self.average = copy.deepcopy(self.actor).requires_grad_(False)
-        self.critic_adam = torch.optim.Adam(self.critics.parameters(), lr=LEARNING_RATE, fused=True)
-        self.actor_adam = torch.optim.Adam([*self.actor.parameters(), *self.value.parameters()], lr=LEARNING_RATE, fused=True)
+        self.critic_adam = adam(self.critics.parameters())
+        self.actor_adam = adam([*self.actor.parameters(), *self.value.parameters()])
         self.updates = 0
 
     def normalise(self, s):
@@ -140,7 +147,7 @@ class Sac:
         self.average.load_state_dict(self.actor.state_dict())
 
     def schedule(self, progress):
-        """Set the learning rate for a share of the training that is done, and return the discount factor."""
+        """Set the learning rate for a share of training that is done (0 to 1). Returns the discount."""
         rate = LEARNING_RATE * min(1, (1 - progress) / max(1 - DECAY_FROM, 1e-9))
         for group in self.critic_adam.param_groups + self.actor_adam.param_groups:
             group["lr"] = rate
@@ -148,8 +155,8 @@ class Sac:
         return 1 - 1 / (start + (end - start) * min(1, 2 * progress))
 
     def update(self, x, a, x2, r, discount):
-        """One update. x, x2 (B, n): Actor.inputs before and after the step; a (B, m); r (B,). Each step is followed by
-        another: a time limit is not terminal. Returns a number that is not finite if a loss is not."""
+        """One update. x, x2 (B, n): Actor.inputs before and after the step; a (B, m); r (B,). No step is
+        terminal (a time limit is none). Returns a number that is not finite if a loss is not."""
         with torch.no_grad():
             q_target = r + discount * self.target(x2).squeeze(1)
         q_loss = 0.5 * ((self.critics(x, a) - q_target) ** 2).mean(1).sum()
@@ -162,7 +169,7 @@ class Sac:
         a_new, log_prob = self.actor(x)
         a_leaf = a_new.detach().requires_grad_()
         q_new = self.critics(x, a_leaf).min(0).values
-        # the trap: a plain backward through q_new would also fill the critics' gradients, and cost another pass
+        # the trap: a plain backward through q_new also fills the critics' gradients, and costs another pass
         slope, = torch.autograd.grad(q_new.sum(), a_leaf)
         actor_loss = (TEMPERATURE * log_prob - (slope * a_new).sum(1)).mean()
         v_loss = 0.5 * ((self.value(x).squeeze(1) - (q_new - TEMPERATURE * log_prob).detach()) ** 2).mean()
@@ -171,18 +178,16 @@ class Sac:
         loss.backward()
         self.actor_adam.step()
         with torch.no_grad():
-            torch._foreach_lerp_(list(self.target.parameters()), list(self.value.parameters()), SMOOTHING)
-            torch._foreach_lerp_(list(self.average.net.parameters()), list(self.actor.net.parameters()), AVERAGED)
+            torch._foreach_lerp_([*self.target.parameters()], [*self.value.parameters()], SMOOTHING)
+            torch._foreach_lerp_([*self.average.net.parameters()], [*self.actor.net.parameters()], AVERAGED)
         return loss.item()
 
 
 # ---------------------------------------------------------------- reward
 
 def reward(mean, log_var, displacement, floor):
-    """Eq. 6 for one step: log p_theta(s_{t+1} | s_t, z) minus its value at the decoder's mean, (B,).
-
-    mean, log_var (B, 2 or 1) of the decoder, displacement (B, 2 or 1) in metres, floor in metres. The subtracted term depends
-    on z alone, so that the objective is the same."""
+    """Eq. 6 for one step, minus its value at the decoder's mean, which depends on z alone, (B,). mean,
+    log_var of the decoder and displacement in metres, (B, 2 or 1) each; floor in metres."""
     variance = (VARIANCE_SCALE * log_var.exp()).clamp(min=floor ** 2)
     return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * mean) ** 2 / variance).sum(1)
 
@@ -196,13 +201,13 @@ def train_wedis(run, decoder):
         if run.new_skills():
             run.z = torch.randn(ROBOTS, m1)  # Alg. 1: sample z_single from the prior
         command, _ = first_step(decoder, run.z)  # Alg. 1: z = (z_single, 0)
-        run.act(command)  # Alg. 1: execute actions; the physics of this step runs on the second core from here on
+        run.act(command)  # Alg. 1: execute actions; the physics runs on the second core from here on
 
         if run.warm():
             progress = run.sac.updates / UPDATES
             discount = run.sac.schedule(progress)
             floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** min(1, max(0, (progress - 0.15) / 0.45))
-            s, a, s2, displacement, z = run.sample(UPDATES_PER_STEP * BATCH)  # Alg. 1: sample a transition batch
+            s, a, s2, displacement, z = run.sample(UPDATES_PER_STEP * BATCH)  # Alg. 1: sample a batch
             fresh = torch.rand(len(z), 1) < RELABELLED
             z = torch.where(fresh, torch.randn(z.shape), z)  # any stored step can be judged by any skill
             command, log_var = first_step(decoder, z)
@@ -215,23 +220,22 @@ def train_wedis(run, decoder):
 
 
 class Run:
-    """What the loops of WEDIS, DADS and SeCTAR share: robots, replay buffer, SAC, clock, reports and checkpoints.
-
-    All robots change skills together, so that SKILL_STEPS steps of a robot are a trajectory of the replay buffer."""
+    """What the three loops share: robots, replay buffer, SAC, clock, reports and checkpoints. All robots
+    change skills together, so that SKILL_STEPS steps of a robot are a trajectory of the replay buffer."""
 
     def __init__(self, z_dim, c_dim, decoder, names, config, model=None):
         self.rng = np.random.default_rng(SEED)
         self.robots = make_robots(ROBOTS, 1)
         self.robots.reset(np.arange(ROBOTS), self.rng)
-        self.sac = Sac(self.robots.observe().shape[1], c_dim, self.robots.ctrl.shape[1])
+        s_dim, a_dim = self.robots.observe().shape[1], self.robots.ctrl.shape[1]
+        self.sac = Sac(s_dim, c_dim, a_dim)
         self.model = nn.ModuleDict(model or {})  # what else a baseline learns
-        self.adam = torch.optim.Adam(self.model.parameters(), lr=LEARNING_RATE, fused=True) if model else None
-        self.widths = (self.robots.observe().shape[1], self.robots.ctrl.shape[1], self.robots.observe().shape[1],
-                       self.robots.places, z_dim)  # s, a, s', displacement, z: one row a step, one gather a batch
+        self.adam = adam(self.model.parameters()) if model else None
+        self.widths = (s_dim, a_dim, s_dim, self.robots.places, z_dim)  # s, a, s', displacement, z
         block = ROBOTS * SKILL_STEPS
         self.replay = torch.zeros(REPLAY // block * block, sum(self.widths))
         self.z = torch.zeros(ROBOTS, z_dim)
-        self.age = self.rng.integers(0, EPISODE, ROBOTS) // SKILL_STEPS * SKILL_STEPS  # or all would start anew at once
+        self.age = self.rng.integers(0, EPISODE, ROBOTS) // SKILL_STEPS * SKILL_STEPS  # not all end at once
         self.steps, self.unstable, self.seconds = 0, 0, 0.0
         self.curve, self.losses, self.metric = [], {}, None
         self.decoder, self.names, self.config = decoder, names, config
@@ -262,13 +266,13 @@ class Run:
         self.begun = s, a, step
 
     def collect(self):
-        """End the step: its samples go to the replay buffer, old robots start anew, reports and checkpoints are made."""
+        """End the step: fill the replay buffer, start old robots anew, make reports and checkpoints."""
         s, a, step = self.begun
         displacement, failed = step.result()
         rows = (self.steps * ROBOTS + torch.arange(ROBOTS)) % len(self.replay)
         self.replay[rows] = torch.cat([s, a, self.robots.observe(), displacement, self.z], 1)
         failed = torch.from_numpy(failed)
-        self.replay[rows[failed]] = self.replay[rows[failed] - ROBOTS]  # an unstable step means nothing: repeat the last
+        self.replay[rows[failed]] = self.replay[rows[failed] - ROBOTS]  # they mean nothing: repeat the last
         self.steps += 1
         self.age += 1
         over = np.flatnonzero((self.age >= EPISODE) | failed.numpy())
@@ -279,9 +283,9 @@ class Run:
         self.seconds += time.time() - self.clock
         updates, every = self.sac.updates, max(1, UPDATES // REPORTS)
         if updates and not all(math.isfinite(value) for value in self.losses.values()):
-            stop(f"a loss is not finite after {updates} updates: {self.losses}; nothing is overwritten: go on from the last "
-                 f"good {artifact_name('policy-checkpoint', EXPERIMENT, SEED)} with --resume true, or lower "
-                 "--learning_rate", code=1)
+            last = artifact_name("policy-checkpoint", EXPERIMENT, SEED)
+            stop(f"a loss is not finite after {updates} updates: {self.losses}; lower --learning_rate, or go "
+                 f"on from the last good {last} with --resume true", code=1)
         if updates // every > (updates - UPDATES_PER_STEP) // every and updates or updates >= UPDATES:
             self.report()
         if time.time() - self.last_save > 60 * CHECKPOINT or updates >= UPDATES:
@@ -307,9 +311,10 @@ class Run:
         row |= self.losses
         self.curve.append(row)
         left = self.seconds / 60 * (UPDATES / self.sac.updates - 1)
-        print("  ".join(f"{name} {value:.3f}" if isinstance(value, float) else f"{name} {value}"
-                        for name, value in row.items()) + f"  {self.sac.updates / self.seconds:.0f} updates/s  "
-              f"{left:.1f} min left", flush=True)
+        text = [f"{name} {value:.3f}" if isinstance(value, float) else f"{name} {value}"
+                for name, value in row.items()]
+        speed = self.sac.updates / self.seconds
+        print(*text, f"{speed:.0f} updates/s", f"{left:.1f} min left", sep="  ", flush=True)
 
     def parts(self):
         sac = self.sac
@@ -319,9 +324,10 @@ class Run:
     def checkpoint(self):
         robots = {name: torch.from_numpy(self.robots.batch.bind(name).copy())
                   for name in ("qpos", "qvel", "ctrl", "time", "qacc_warmstart")}
-        save(OUT, "policy-checkpoint", EXPERIMENT, SEED, self.config, parts=[part.state_dict() for part in self.parts()],
-             replay=self.replay[:self.steps * ROBOTS].clone(), z=self.z, age=torch.from_numpy(self.age), robots=robots,
-             numbers=[self.sac.updates, self.steps, self.unstable, self.seconds], curve=self.curve,
+        save(OUT, "policy-checkpoint", EXPERIMENT, SEED, self.config, robots=robots, z=self.z,
+             parts=[part.state_dict() for part in self.parts()], curve=self.curve,
+             replay=self.replay[:self.steps * ROBOTS].clone(), age=torch.from_numpy(self.age),
+             numbers=[self.sac.updates, self.steps, self.unstable, self.seconds],
              torch_rng=torch.get_rng_state(), numpy_rng=self.rng.bit_generator.state)
         self.last_save = time.time()
 
@@ -344,31 +350,29 @@ class Run:
 # ---------------------------------------------------------------- relation functions
 
 def calibrate_relation(decoder, names, steps):
-    """Alg. 1, "Test: find relation functions", from the decoder alone: for each factor of z_multi the weight with which single
-    steps, moved by the relation function (common.next_skill), come nearest to the decoder's free run of `steps`.
+    """Alg. 1, "Test: find relation functions": for each factor of z_multi the weight with which single steps,
+    changed by the relation function (common.next_skill), come nearest to the decoder's free run of `steps`.
+    Returns {factor: weight} and prints how far the two are apart (RMS, as a share of the RMS step)."""
+    def apart(z, factor, weight):
+        chain = commands_of(as_policy(None, decoder, names, {factor: weight}), z, steps)
+        free = decoder(z, steps)[0]
+        return ((chain - free).square().mean() / free.square().mean()).sqrt().item()
 
-    Returns {factor: weight} and prints how far the steps are apart (RMS, as a share of the RMS step)."""
+    grid = torch.linspace(-Z_RANGE, Z_RANGE, 13)
     relation = {}
     for factor in [name for name in names if name in MULTI]:
-        grid = torch.linspace(-Z_RANGE, Z_RANGE, 13)
-        pairs = torch.cartesian_prod(grid, grid)
-        z = torch.zeros(len(pairs), len(names))
-        z[:, names.index("speed")], z[:, names.index(factor)] = pairs.T  # direction 0: it stays within what 02 trains on
-        free = decoder(z, steps)[0]
-
-        def apart(weight):
-            steps_of = commands_of(as_policy(None, decoder, names, {factor: weight}), z, steps)
-            return ((steps_of - free).square().mean() / free.square().mean()).sqrt().item()
-
-        weights = np.linspace(-1, 1, 401)
-        relation[factor] = round(float(min(weights, key=apart)), 4)
-        print(f"relation function of {factor}: weight {relation[factor]:+.3f} (the paper, by hand: 0.2 for curvature, 0.1 for "
-              f"acceleration); {apart(relation[factor]):.1%} from the decoder's free run, {apart(0.0):.1%} without it")
+        z = torch.zeros(len(grid) ** 2, len(names))  # direction 0: it stays within what 02 trains on
+        z[:, [names.index("speed"), names.index(factor)]] = torch.cartesian_prod(grid, grid)
+        weights = np.linspace(-1, 1, 401).round(4).tolist()
+        errors = {weight: apart(z, factor, weight) for weight in weights}
+        best = relation[factor] = min(errors, key=errors.get)
+        print(f"relation function of {factor}: weight {best:+.3f}, {errors[best]:.1%} from the decoder's "
+              f"free run ({errors[0.0]:.1%} without it)")
     return relation
 
 
 def as_policy(actor, decoder, names, relation):
-    return common.SimpleNamespace(actor=actor, decoder=decoder, names=names, relation=relation, scale=STEP_SCALE)
+    return SimpleNamespace(actor=actor, decoder=decoder, names=names, relation=relation, scale=STEP_SCALE)
 
 
 # ---------------------------------------------------------------- main
@@ -390,15 +394,16 @@ def main():
         decoder, names, relation = run.decoder, [], {}
         dict(dads=train_dads, sectar=train_sectar)[METHOD](run)
     if TRAIN:
-        save(OUT, "policy", EXPERIMENT, SEED, config, actor=pack(run.sac.average), decoder=pack(decoder), method=METHOD,
-             robot=ROBOT, names=names, relation=relation, scale=STEP_SCALE, length=source["length"], curve=run.curve,
-             updates=run.sac.updates, env_steps=run.steps * ROBOTS, seconds=run.seconds)
+        save(OUT, "policy", EXPERIMENT, SEED, config, actor=pack(run.sac.average), decoder=pack(decoder),
+             method=METHOD, robot=ROBOT, names=names, relation=relation, scale=STEP_SCALE,
+             length=source["length"], curve=run.curve, updates=run.sac.updates,
+             env_steps=run.steps * ROBOTS, seconds=run.seconds)
         if run.unstable:
-            print(f"{run.unstable} steps were unstable in MuJoCo: those robots started anew, the steps are left out")
+            print(f"{run.unstable} steps were unstable in MuJoCo: left out, their robots started anew")
     policy = load_policy(OUT, EXPERIMENT, SEED)
     if (policy.method, policy.robot, policy.scale) != (METHOD, ROBOT, STEP_SCALE):
-        stop(f"{artifact_name('policy', EXPERIMENT, SEED)} was trained with --method {policy.method} --robot {policy.robot} "
-             f"--step_scale {policy.scale}; give the same, or train anew")
+        stop(f"{artifact_name('policy', EXPERIMENT, SEED)} was trained with --method {policy.method} --robot "
+             f"{policy.robot} --step_scale {policy.scale}; give the same, or train anew")
     measure(policy, source["ranges"])
     draw_skills(policy)
     draw_learning_curve(policy.curve)
@@ -412,28 +417,26 @@ def check_constants(decoder, names):
     if METHOD != "wedis" and ROBOT != "ant" or METHOD == "sectar" and Z_DIM < 3:
         stop("DADS and SeCTAR learn on the Ant alone: --robot ant; SeCTAR's --z_dim is at least 3")
     if names[0] != "speed" or not set(names) <= set(SINGLE + MULTI):
-        stop(f"the decoder {DECODER} has axes {' '.join(names)}, a policy needs speed, and may have direction, curvature, "
-             "acceleration: choose another --decoder")
+        stop(f"the decoder {DECODER} has axes {' '.join(names)}; a policy needs speed, and may have "
+             "direction, curvature, acceleration: choose another --decoder")
     if decoder.x_dim != make_robots(1, 1).places:
-        stop(f"the decoder {DECODER} predicts {decoder.x_dim} coordinates, too few or too many for the {ROBOT}: choose "
-             "another --decoder or --robot")
+        stop(f"the decoder {DECODER} predicts {decoder.x_dim} coordinates, which do not fit the {ROBOT}: "
+             "choose another --decoder or --robot")
     if BASE_FRAME and ROBOT != "ant":
         stop("only a robot in the plane has a base frame: --base_frame false")
-    above_0 = dict(UPDATES=UPDATES, ROBOTS=ROBOTS, EPISODE=EPISODE, SKILL_STEPS=SKILL_STEPS, WARM_UP=WARM_UP, BATCH=BATCH,
-                   UPDATES_PER_STEP=UPDATES_PER_STEP, HIDDEN=HIDDEN, THREADS=THREADS, REPORTS=REPORTS, Z_DIM=Z_DIM,
-                   ACTOR_EVERY=ACTOR_EVERY, RECENT=RECENT, MODEL_BATCH=MODEL_BATCH, PRIOR_SAMPLES=PRIOR_SAMPLES,
-                   DIRECTIONS=DIRECTIONS, NOISY=NOISY, STARTS=STARTS, STEP_SCALE=STEP_SCALE, FLOOR_START=FLOOR_START,
-                   FLOOR_END=FLOOR_END, VARIANCE_SCALE=VARIANCE_SCALE, LEARNING_RATE=LEARNING_RATE, Z_RANGE=Z_RANGE,
-                   SINGLE_RUN=min(SINGLE_RUN), MULTI_RUN=min(MULTI_RUN), TRAVERSAL=TRAVERSAL - 1)
-    for name, value in above_0.items():
-        if value <= 0:
-            stop(f"--{name.lower()} is too small")
-    if max(DISCOUNT, DISCOUNT_START) >= 1 or max(RELABELLED, EXPLORE, AVERAGED, SMOOTHING, DECAY_FROM) > 1:
-        stop("discounts must be below 1; shares and rates at most 1")
+    for name in ("UPDATES ROBOTS EPISODE SKILL_STEPS WARM_UP BATCH UPDATES_PER_STEP HIDDEN THREADS REPORTS "
+                 "Z_DIM ACTOR_EVERY RECENT MODEL_BATCH PRIOR_SAMPLES DIRECTIONS NOISY STARTS STEP_SCALE "
+                 "FLOOR_START FLOOR_END VARIANCE_SCALE LEARNING_RATE Z_RANGE SINGLE_RUN MULTI_RUN").split():
+        if np.min(globals()[name]) <= 0:
+            stop(f"--{name.lower()} must be above 0")
+    if TRAVERSAL < 2 or any(value % 1 for value in SINGLE_RUN + MULTI_RUN):
+        stop("--traversal is at least 2; --single_run and --multi_run are two whole numbers each")
+    if not DISCOUNT_START <= DISCOUNT < 1 or max(RELABELLED, EXPLORE, AVERAGED, SMOOTHING, DECAY_FROM) > 1:
+        stop("--discount is at least --discount_start and below 1; shares and rates are at most 1")
     block = ROBOTS * SKILL_STEPS
     if EPISODE % SKILL_STEPS or REPLAY < max(WARM_UP, 2 * block) or METHOD == "sectar" and WARM_UP < block:
-        stop(f"--skill_steps must divide --episode; --replay must be at least --warm_up and {2 * block} (two skills of all "
-             f"robots), and for SeCTAR --warm_up at least {block}")
+        stop(f"--skill_steps must divide --episode; --replay is at least --warm_up and {2 * block} (two "
+             f"skills of all robots); for SeCTAR --warm_up is at least {block}")
 
 
 # ================================================================ Baselines: not needed to understand WEDIS
@@ -448,18 +451,19 @@ def make_baseline(config):
 
 
 def train_dads(run):
-    """Sharma et al. 2019: skills z ~ U(-1, 1)^2; a step is worth its mutual information with z under the skill dynamics
-    q(displacement | z), which learn too. The reward is computed with the q of now, so that old and relabelled steps count."""
+    """Sharma et al. 2019: skills z ~ U(-1, 1)^2; a step is worth its mutual information with z under the
+    skill dynamics q(displacement | z), which learn too. It is computed with the q of now: old steps count."""
     q = run.decoder
 
     def log_q(displacement, log_weight, mean):
-        """log q: displacement (B, 2) under its own mixture -> (B,); (B, 1, 2) under all L mixtures -> (B, L)."""
+        """log q: displacement (B, 2) under its own mixture -> (B,); (B, 1, 2) under all L ones -> (B, L)."""
         x = (displacement / STEP_SCALE - q.x_mean) / q.x_std
-        return (log_weight - 0.5 * (x[..., None, :] - mean).square().sum(-1)).logsumexp(-1) - math.log(2 * math.pi)
+        square = (x[..., None, :] - mean).square().sum(-1)
+        return (log_weight - 0.5 * square).logsumexp(-1) - math.log(2 * math.pi)
 
     @torch.no_grad()
     def information(displacement, z):
-        """log(L + 1) - log(1 + sum_i exp(log q(.|z_i) - log q(.|z))), (B,); the L samples of the prior are the same for all."""
+        """log(L + 1) - log(1 + sum_i exp(log q(.|z_i) - log q(.|z))), (B,); one set of L for the batch."""
         own = log_q(displacement, *q.mixture(z))
         others = log_q(displacement[:, None], *q.mixture(torch.rand(PRIOR_SAMPLES, Z_DIM) * 2 - 1))
         return math.log(PRIOR_SAMPLES + 1) - (1 + (others - own[:, None]).clamp(-50, 50).exp().sum(1)).log()
@@ -474,7 +478,7 @@ def train_dads(run):
             run.z = torch.rand(ROBOTS, Z_DIM) * 2 - 1
         run.act(run.z)
         if run.warm():
-            # q learns from recent steps and the skills that made them (from relabelled ones it would learn that z means nothing)
+            # from recent steps and their own skills: from relabelled ones q learns that z means nothing
             _, _, _, displacement, z = run.sample(MODEL_BATCH, RECENT)
             q.x_mean.lerp_(displacement.mean(0) / STEP_SCALE, 0.02)
             q.x_std.lerp_(displacement.std(0) / STEP_SCALE, 0.02)
@@ -496,11 +500,12 @@ def train_dads(run):
 
 
 class TrajectoryEncoder(nn.Module):
-    """q_phi(z | tau) of SeCTAR: a bidirectional LSTM over displacements (B, T, 2), mean-pooled. Returns mean, log-variance."""
+    """q_phi(z | tau) of SeCTAR: a bidirectional LSTM over (B, T, 2). Returns mean, log-variance."""
 
     def __init__(self, hidden=64):
         super().__init__()
-        self.lstm, self.head = nn.LSTM(2, hidden, bidirectional=True, batch_first=True), nn.Linear(2 * hidden, 2 * Z_DIM)
+        self.lstm = nn.LSTM(2, hidden, bidirectional=True, batch_first=True)
+        self.head = nn.Linear(2 * hidden, 2 * Z_DIM)
 
     def forward(self, x):
         return self.head(self.lstm(x)[0].mean(1)).chunk(2, 1)
@@ -510,17 +515,17 @@ EXPLORER = 3.0  # last entry of the z of SeCTAR's explorer: far from N(0, I), an
 
 
 def train_sectar(run):
-    """Co-Reyes et al. 2018: skills z ~ N(0, I) for SKILL_STEPS steps. Encoder and state decoder learn from the trajectories of
-    an explorer. A skill's trajectory is worth the likelihood of ending where the state decoder says; the explorer's, what the
-    VAE can not reconstruct. The explorer is the same policy, asked for steps that are far too long, in any direction."""
+    """Co-Reyes et al. 2018: skills z ~ N(0, I); the VAE learns from the trajectories of an explorer, the same
+    policy asked for far too long steps in any direction. Reward of a skill: the likelihood of ending where
+    the decoder says; of the explorer: what the VAE cannot reconstruct."""
     encoder, decoder = run.model["encoder"], run.decoder
 
     def elbo(x):
-        """x (B, T, 2) in trajectory units -> sum_t log p(x_t | z) and KL(q || p), (B,) each, and decoded means (B, T, 2)."""
+        """x (B, T, 2), trajectory units -> sum_t log p(x_t | z), KL(q || p), (B,), and means (B, T, 2)."""
         mean, log_var = encoder(x)
         kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1)
         decoded, variance = decoder(mean + (0.5 * log_var).exp() * torch.randn_like(mean), SKILL_STEPS)
-        variance = variance.exp().clamp(min=(FLOOR_END / STEP_SCALE) ** 2)  # or standing still has a likelihood without bound
+        variance = variance.exp().clamp(min=(FLOOR_END / STEP_SCALE) ** 2)  # or likelihoods have no bound
         return -0.5 * (variance.log() + (x - decoded) ** 2 / variance).sum((1, 2)), kl, decoded
 
     def trajectories(n, recent):
@@ -572,13 +577,14 @@ def train_sectar(run):
             with torch.no_grad():
                 decoded = decoder(z, SKILL_STEPS)[0]
                 decoded[explorer] = elbo(x[explorer])[2] if explorer.any() else decoded[explorer]
-                # how far from the decoded place a trajectory ends (a Laplace likelihood of the place), shared among its steps;
-                # by single steps a skill would be paid for not trembling, which is standing still
+                # Laplace likelihood of the place where a trajectory ends, shared among its steps. The trap:
+                # judged by single steps, a skill is paid for not trembling, which is standing still
                 miss = x - decoded
                 away = (miss * nn.functional.normalize(miss.sum(1))[:, None]).sum(2).gather(1, t)
                 r = REWARD_SCALE * torch.where(explorer[:, None], away, -away).flatten()
                 commands, i = steps_of(z, decoded), torch.arange(len(rows))[:, None]
-                c, c2 = commands[i, t].flatten(0, 1), commands[i, (t + 1).clamp(max=SKILL_STEPS - 1)].flatten(0, 1)
+                c = commands[i, t].flatten(0, 1)
+                c2 = commands[i, (t + 1).clamp(max=SKILL_STEPS - 1)].flatten(0, 1)
                 s, a, s2, _, _ = run.replay[rows.gather(1, t).flatten()].split(run.widths, 1)
                 x, x2 = run.sac.actor.inputs(s, c), run.sac.actor.inputs(s2, c2)
             order = torch.randperm(len(x))
@@ -588,15 +594,14 @@ def train_sectar(run):
         run.collect()
 
 
-# ================================================================ Measuring and drawing: not needed to understand WEDIS
+# ================================================================ Measuring and drawing: not needed for WEDIS
 
 def make_robots(n, threads):
     return Robots(ant_spec() if ROBOT == "ant" else half_cheetah_spec(), n, threads)
 
 
 def traversal(policy, axis, values):
-    """Skills with one axis at values, the others at 0; acceleration at z_speed = -1 in one dimension, where it is nothing
-    at speed 0."""
+    """Skills with one axis at values, the others at 0 (with acceleration on a rail: z_speed at -1)."""
     z = torch.zeros(len(values), len(policy.names) or Z_DIM)
     if policy.names == ["speed", "acceleration"] and axis == 1:
         z[:, 0] = -1
@@ -605,8 +610,8 @@ def traversal(policy, axis, values):
 
 
 def grid(policy):
-    """Skills of the tracking error, z_multi = 0. In the plane 5 speeds x DIRECTIONS; on a rail 8 speeds; DADS 5 x 5; SeCTAR, of
-    eight axes, 25 fixed draws from the prior."""
+    """Skills of the tracking error, z_multi = 0: 5 speeds x DIRECTIONS (on a rail 8 speeds), DADS 5 x 5,
+    SeCTAR 25 fixed draws from the prior."""
     ends = torch.linspace(-Z_RANGE, Z_RANGE, 5)
     if METHOD == "sectar":
         return torch.randn(25, Z_DIM, generator=torch.Generator().manual_seed(0))
@@ -619,8 +624,8 @@ def grid(policy):
 
 
 def roll_out(policy, z, run, closed, noise=None, run_in=0):
-    """Execute skills z (n, M) with mean actions. run: (T, H_z). Returns places (n, T * H_z + 1, 2 or 1) in metres. From rest, or
-    with noise (a seed) from noisy starts; recorded after run_in steps (from rest a first step is short)."""
+    """Execute skills z (n, M) with mean actions, run = (T, H_z): places (n, T * H_z + 1, 2 or 1) in metres.
+    From rest, or with noise (a seed) from noisy starts; recorded after run_in steps."""
     robots = make_robots(len(z), THREADS)
     if noise is not None:
         robots.reset(np.arange(len(z)), np.random.default_rng(noise))
@@ -643,13 +648,15 @@ def predicted_path(policy, z, run):
 def tracking(policy, closed):
     """Tracking error: RMS(executed end - predicted end) / RMS(predicted end) over the grid, from rest."""
     z = grid(policy)
-    executed, predicted = roll_out(policy, z, SINGLE_RUN, closed)[:, -1], predicted_path(policy, z, SINGLE_RUN)[:, -1]
+    executed = roll_out(policy, z, SINGLE_RUN, closed)[:, -1]
+    predicted = predicted_path(policy, z, SINGLE_RUN)[:, -1]
     return math.sqrt(((executed - predicted) ** 2).sum() / (predicted ** 2).sum())
 
 
 def following(policy, closed):
-    """Following error: three random skills one after another, as a planner draws them, from noisy starts. Returns median and
-    90 % quantile of |executed - predicted end| of a skill in metres, and the share of robots that ever turn over."""
+    """Following error: three random skills one after another from noisy starts. Returns median and 90 %
+    quantile of |executed - predicted end| of a skill in metres, and the share of robots that ever turn
+    over."""
     rng = np.random.default_rng(SEED)
     robots = make_robots(STARTS, THREADS)
     robots.reset(np.arange(STARTS), rng)
@@ -667,7 +674,7 @@ def following(policy, closed):
 
 
 def executed_cross_talk(policy, ranges, closed):
-    """Cross-talk C (axes, factors) of executed skills, the mean over noisy starts; displacements per fifth of a skill."""
+    """Cross-talk C (axes, factors) of executed skills, the mean over noisy starts, per fifth of a skill."""
     values, curves = np.linspace(-Z_RANGE, Z_RANGE, TRAVERSAL), []
     every = max(1, int(MULTI_RUN[0] * MULTI_RUN[1]) // 5)
     for axis in range(len(policy.names) or Z_DIM):
@@ -679,49 +686,47 @@ def executed_cross_talk(policy, ranges, closed):
 
 
 def match(C):
-    """Which axis is which factor, one-to-one, so that their purities sum to most (the axes of baselines have no names). With fewer
-    axes than factors some factors have none. Returns {factor: axis}, by number."""
+    """Which axis is which factor, by the largest sum of purities (the axes of baselines have no names).
+    Returns {factor: axis}, one-to-one, by number; with fewer axes than factors some factors are missing."""
     share = C / np.maximum(C.sum(1, keepdims=True), 1e-9)
     axes = list(range(len(C))) + [None] * C.shape[1]
-    best = max(permutations(axes, C.shape[1]), key=lambda pick: sum(share[i, j] for j, i in enumerate(pick) if i is not None))
-    return {j: i for j, i in enumerate(best) if i is not None}
+    picks = permutations(axes, C.shape[1])
+    choices = [{j: i for j, i in enumerate(pick) if i is not None} for pick in picks]
+    return max(choices, key=lambda pick: sum(share[i, j] for j, i in pick.items()))
 
 
 def measure(policy, ranges):
     """Print and write one row of results/policies.csv. _open: open loop, as in the paper."""
-    row = dict(experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy.updates, env_steps=policy.env_steps,
-               train_minutes=policy.seconds / 60, tracking_error=tracking(policy, False))
-    columns = [*row] + ["tracking_error_closed"]
-    for end in ("_open", ""):
-        columns += [name + end for name in ("follow_median_m", "follow_p90_m", "fall_rate")]
-        columns += [f"purity_{name}{end}" for name in SINGLE + MULTI]
-    C = executed_cross_talk(policy, ranges, False)
-    axes = {j: j for j in range(len(ranges))} if policy.names else match(C)
-    row |= {f"purity_{name}_open": purity(C, axes[j], j) for j, name in enumerate(ranges) if j in axes}
-    if policy.names:
-        row["tracking_error_closed"] = tracking(policy, True)
-        for closed, end in ((False, "_open"), (True, "")):
-            found = following(policy, closed)
-            row |= {"follow_median_m" + end: found[0], "follow_p90_m" + end: found[1], "fall_rate" + end: found[2]}
-        C = executed_cross_talk(policy, ranges, True)
-        row |= {f"purity_{name}": purity(C, j, j) for j, name in enumerate(ranges)}
-    if policy.curve and "metric" in policy.curve[-1]:
-        row["metric"] = policy.curve[-1]["metric"]
+    row = dict(experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy.updates,
+               env_steps=policy.env_steps, train_minutes=policy.seconds / 60,
+               tracking_error=tracking(policy, False),
+               tracking_error_closed=tracking(policy, True) if policy.names else "")
+    follow = ("follow_median_m", "follow_p90_m", "fall_rate")
+    for closed, end in ((False, "_open"), (True, "")):
+        row |= {name + end: "" for name in (*follow, *(f"purity_{name}" for name in SINGLE + MULTI))}
+        if policy.names:
+            row |= {name + end: value for name, value in zip(follow, following(policy, closed))}
+        if policy.names or not closed:  # the commands of DADS are no places: open loop alone
+            C = executed_cross_talk(policy, ranges, closed)
+            axes = {j: j for j in range(len(ranges))} if policy.names else match(C)
+            for j, i in axes.items():
+                row[f"purity_{list(ranges)[j]}{end}"] = purity(C, i, j)
+    row["metric"] = policy.curve[-1].get("metric", "") if policy.curve else ""
     for name, value in row.items():
         print(f"{name:24s} {value:.3f}" if isinstance(value, float) else f"{name:24s} {value}")
-    update_csv(Path(OUT) / "results" / "policies.csv", [{name: row.get(name, "") for name in columns + ["metric"]}],
-               ("experiment", "seed"))
+    update_csv(Path(OUT) / "results" / "policies.csv", [row], ("experiment", "seed"))
 
 
 def draw_skills(policy):
-    """Fig 5, 15, 16: predicted and executed skills, open and (WEDIS) closed loop; a column per axis. On a rail the latent is on
-    the y axis, and transitions have colours."""
+    """Fig 5, 15, 16: predicted and executed skills, open and (WEDIS) closed loop, a column per axis. On a
+    rail the latent is on the y axis, and transitions have colours."""
     names = policy.names or [str(i + 1) for i in range(Z_DIM)]
     rows = ("predicted", "executed, open loop", "executed, closed loop")[:2 + bool(policy.names)]
+    rail = policy.decoder.x_dim == 1
     size = 3.0 if len(names) < 5 else 2.0
-    figure, axes = plt.subplots(len(rows), len(names), figsize=(size * len(names) + 1, size * len(rows)), squeeze=False)
+    figure, axes = plt.subplots(len(rows), len(names), squeeze=False,
+                                figsize=(size * len(names) + 1, size * len(rows)))
     for i, name in enumerate(names):
-        rail = policy.decoder.x_dim == 1
         run = MULTI_RUN if rail or name in MULTI else SINGLE_RUN
         values, colours = np.array(list(common.LATENT_COLOURS)), list(common.LATENT_COLOURS.values())
         if rail:
@@ -730,47 +735,52 @@ def draw_skills(policy):
             values = np.linspace(-1.5, 1.5, DIRECTIONS + 1)[:-1]
             colours = plt.get_cmap("twilight")(np.linspace(0.1, 0.9, DIRECTIONS))
         z = traversal(policy, i, values)
-        paths = [predicted_path(policy, z, run)] + [roll_out(policy, z, run, closed) for closed in (False, True)]
-        paths = paths[:len(rows)]
-        low, high = np.min([path.min((0, 1)) for path in paths], 0), np.max([path.max((0, 1)) for path in paths], 0)
-        middle, reach = (low + high) / 2, 0.6 * (high - low).max() + 0.01  # one scale for all rows of a column
+        paths = [predicted_path(policy, z, run)]
+        paths += [roll_out(policy, z, run, closed) for closed in (False, True)[:len(rows) - 1]]
+        low = np.min([path.min((0, 1)) for path in paths], 0)
+        high = np.max([path.max((0, 1)) for path in paths], 0)
+        reach = 0.6 * (high - low).max() + 0.01  # one scale for all rows of a column
+        limits = [(middle - reach, middle + reach) for middle in (low + high) / 2]
         for ax, path in zip(axes[:, i], paths):
             marks = path[:, ::1 if path is paths[0] else int(run[1])]
-            for t, colour in enumerate(plt.get_cmap("plasma")(np.linspace(0, 0.85, marks.shape[1])) if rail else ()):
-                ax.plot(marks[:, t, 0], values, ".", color=colour, label=f"t = {t}")
-            for line, dots, value, colour in zip(path, marks, values, () if rail else colours):
+            ax.set_xlim(limits[0])
+            if rail:
+                for t, colour in enumerate(plt.get_cmap("plasma")(np.linspace(0, 0.85, marks.shape[1]))):
+                    ax.plot(marks[:, t, 0], values, ".", color=colour, label=f"t = {t}")
+                continue
+            ax.set(ylim=limits[1], aspect="equal")
+            for line, dots, value, colour in zip(path, marks, values, colours):
                 ax.plot(*line.T, color=colour, lw=1.3, label=f"{value:g}")
                 ax.plot(*dots.T, "o", ms=3 if len(dots) < 10 else 0, color=colour)
-            ax.set(xlim=(middle[0] - reach, middle[0] + reach))
-            if not rail:
-                ax.set(ylim=(middle[1] - reach, middle[1] + reach), aspect="equal")
         axes[0, i].set_title(f"$z_{{{name}}}$, $T$ = {int(run[0])}, $H_z$ = {int(run[1])}")
         axes[-1, i].set_xlabel("x (m)")
         if len(values) > 9:
             axes[0, i].legend(fontsize=5, ncols=2, handlelength=1)
     for ax, text in zip(axes[:, 0], rows):
-        ax.set_ylabel(f"{text}\n" + ("latent" if policy.decoder.x_dim == 1 else "y (m)"))
+        ax.set_ylabel(f"{text}\n{'latent' if rail else 'y (m)'}")
     handles = axes[0, 0].get_legend_handles_labels()
-    figure.legend(*handles, title="transition" if policy.decoder.x_dim == 1 else "latent", loc="outside right upper")
+    figure.legend(*handles, title="transition" if rail else "latent", loc="outside right upper")
     save_figure(figure, OUT, FIGURE or f"skills_{EXPERIMENT}")
 
 
 def draw_learning_curve(curve):
     """Tracking error and, of a baseline, its own measure against the minutes of training; a line per seed."""
-    folder, name = Path(OUT) / "results", f"learning_curve_{EXPERIMENT}"
     if not curve:
         return
+    folder, name = Path(OUT) / "results", f"learning_curve_{EXPERIMENT}"
     update_csv(folder / f"{name}_seed{SEED}.csv", curve, ())
     curves = [read_csv(path) for path in sorted(folder.glob(f"{name}_seed*.csv"))]
-    shown = {"tracking_error": "tracking error, open loop", "tracking_error_closed": "tracking error, closed loop",
-             "metric": dict(dads="mutual information (nats)", sectar="reconstruction error").get(METHOD)}
-    shown = {column: label for column, label in shown.items() if column in curve[-1]}
+    labels = {"tracking_error": "tracking error, open loop",
+              "tracking_error_closed": "tracking error, closed loop",
+              "metric": "mutual information (nats)" if METHOD == "dads" else "reconstruction error"}
+    shown = [column for column in labels if column in curve[-1]]
     figure, axes = plt.subplots(1, len(shown), figsize=(4 * len(shown), 2.8), squeeze=False)
-    for ax, (column, label) in zip(axes[0], shown.items()):
+    for ax, column in zip(axes[0], shown):
         for rows in curves:
-            ax.plot([float(row["minutes"]) for row in rows], [float(row[column]) for row in rows], lw=1.2, color=common.BLUE)
-        ax.set(xlabel=f"minutes of training, {len(curves)} seed(s)", ylabel=label)
-        if "error" in label:
+            points = np.array([(row["minutes"], row[column]) for row in rows], float)
+            ax.plot(*points.T, lw=1.2, color=common.BLUE)
+        ax.set(xlabel=f"minutes of training, {len(curves)} seed(s)", ylabel=labels[column])
+        if "error" in labels[column]:
             ax.set_ylim(0, 1.1)
     save_figure(figure, OUT, name)
 
@@ -778,12 +788,12 @@ def draw_learning_curve(curve):
 def draw_robots():
     """Fig 14: both robots, rendered by MuJoCo off-screen."""
     figure, axes = plt.subplots(1, 2, figsize=(8, 3.2))
-    for ax, title, spec, look in zip(axes, ("Ant", "Half-Cheetah"), (ant_spec(), half_cheetah_spec()), (0.5, 0.5)):
+    for ax, title, spec in zip(axes, ("Ant", "Half-Cheetah"), (ant_spec(), half_cheetah_spec())):
         model = spec.compile()
         data, camera = mujoco.MjData(model), mujoco.MjvCamera()
         data.qpos[:] = model.key_qpos[0] if model.nkey else model.qpos0
         mujoco.mj_forward(model, data)
-        camera.lookat, camera.distance, camera.azimuth, camera.elevation = (0, 0, look), 3, 120, -20
+        camera.lookat, camera.distance, camera.azimuth, camera.elevation = (0, 0, 0.5), 3, 120, -20
         try:
             renderer = mujoco.Renderer(model, 400, 500)
         except Exception:  # no GL library, no device: the kinds differ by platform
@@ -797,42 +807,8 @@ def draw_robots():
 
 
 def half_cheetah_spec():
-    """The Half-Cheetah of the MuJoCo benchmarks (6 hinges on a rail), built in code. nq 9, nv 9, nu 6, Euler at 0.01 s."""
-    spec = mujoco.MjSpec()
-    spec.modelname, spec.compiler.degree = "cheetah", False
-    spec.option.timestep = 0.01
-    joint, geom = spec.default.joint, spec.default.geom
-    joint.armature, joint.limited, joint.solimp_limit[:3], joint.solref_limit = 0.1, True, [0, 0.8, 0.03], [0.02, 1]
-    geom.condim, geom.conaffinity, geom.friction, geom.solimp[:3], geom.rgba = 3, 0, [0.4, 0.1, 0.1], [0, 0.8, 0.01], [0.8, 0.6, 0.4, 1]
-    geom.density = 660.8849500774735  # 14 kg in all
-
-    def capsule(body, name, x, z, angle, half_length):
-        body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.046, half_length, 0], pos=[x, 0, z],
-                      quat=[math.cos(angle / 2), 0, math.sin(angle / 2), 0])
-
-    spec.worldbody.add_light(pos=[0, 0, 1.3], dir=[0.2, 0.4, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[40, 40, 40], conaffinity=1, rgba=[0.85, 0.88, 0.85, 1])
-    torso = spec.worldbody.add_body(name="torso", pos=[0, 0, 0.7])
-    for name, kind, axis in (("rootx", "SLIDE", [1, 0, 0]), ("rootz", "SLIDE", [0, 0, 1]), ("rooty", "HINGE", [0, 1, 0])):
-        torso.add_joint(name=name, type=getattr(mujoco.mjtJoint, f"mjJNT_{kind}"), axis=axis, armature=0, limited=False)
-    torso.add_geom(name="torso", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[-0.5, 0, 0, 0.5, 0, 0], size=[0.046, 0, 0])
-    capsule(torso, "head", 0.6, 0.1, 0.87, 0.15)
-    for part in (  # name, position, joint: range, stiffness, damping; geom: x, z, angle, half length; gear
-            [("bthigh", [-0.5, 0, 0], [-0.52, 1.05], 240, 6, (0.1, -0.13, -3.8, 0.145), 120),
-             ("bshin", [0.16, 0, -0.25], [-0.785, 0.785], 180, 4.5, (-0.14, -0.07, -2.03, 0.15), 90),
-             ("bfoot", [-0.28, 0, -0.14], [-0.4, 0.785], 120, 3, (0.03, -0.097, -0.27, 0.094), 60)],
-            [("fthigh", [0.5, 0, 0], [-1, 0.7], 180, 4.5, (-0.07, -0.12, 0.52, 0.133), 120),
-             ("fshin", [-0.14, 0, -0.24], [-1.2, 0.87], 120, 3, (0.065, -0.09, -0.6, 0.106), 60),
-             ("ffoot", [0.13, 0, -0.18], [-0.5, 0.5], 60, 1.5, (0.045, -0.07, -0.6, 0.07), 30)]):
-        body = torso
-        for name, pos, bend, stiffness, damping, shape, gear in part:
-            body = body.add_body(name=name, pos=pos)
-            body.add_joint(name=name, axis=[0, 1, 0], range=bend, stiffness=[stiffness, 0, 0], damping=[damping, 0, 0])
-            capsule(body, name, *shape)
-            motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, ctrllimited=True, ctrlrange=[-1, 1])
-            motor.set_to_motor()
-            motor.gear[0] = gear
-    return spec
+    """The Half-Cheetah of the MuJoCo benchmarks. nq 9, nv 9, nu 6."""
+    return mujoco.MjSpec.from_file(str(common.HERE / "half_cheetah.xml"))
 
 
 if __name__ == "__main__":

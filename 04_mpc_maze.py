@@ -11,6 +11,7 @@ XX policies and XX trials of each. The start is 26.8 m from the goal.
 import hashlib
 import io
 import json
+import logging
 import math
 import time
 from functools import cache, partial
@@ -23,6 +24,7 @@ from common import BLUE, GREY, RED, commands_of, execute, plt, stop
 import mujoco
 import numpy as np
 import torch
+from matplotlib.colors import to_rgb
 from PIL import Image  # comes with matplotlib
 
 EXPERIMENT = "mazes"        # row of EXPERIMENTS below
@@ -59,6 +61,11 @@ RADIUS = 1.0                # metres by which the planner grows the walls: the r
 START = (0.0, 0.0)          # x and y, metres
 GOAL = (24.0, 12.0)         # 26.8 m away, 36 m along the axes
 
+# Driving by hand
+DRIVE = False               # true: plan nothing, serve a page with a slider for each axis of z
+SECONDS = 0.0               # until it ends by itself; 0: when the page is closed
+PORT = 8080                 # of the page, on this machine alone; 0: the first free one
+
 METHODS = {  # Table 2; a row wins over a maze's, or a maze would give a scale to WEDIS-NTS
     "wedis": {},
     "wedis_s": dict(MODES="printed", LENGTH=1, PLANNED_DENSE=4, PLANNED_SPARSE=15),  # single steps
@@ -75,6 +82,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs; its
                     SAMPLES="10 30 100 300 1000 3000"),
     "fig18": dict(MAZES="s_maze obstacles", REWARDS="dense", MODES="closed", POLICY_SEEDS="0 1 2",
                   DRAW="fig18"),
+    "drive": dict(DRIVE=True, MAZES="open", MODES="closed"),
     "matched": dict(METHOD=" ".join(METHODS), POLICY_SEEDS="0 1 2", TRIALS=20, DRAW="", LOOK_AHEAD="200 600"),
 }
 HULL = [(-7, -6, -7, 19), (31, 32, -7, 19), (-7, 32, -7, -6), (-7, 32, 18, 19)]  # x0, x1, y0, y1, metres
@@ -86,6 +94,7 @@ MAZE = {  # walls, and the constants in which a maze differs; plan a row of your
                    GOAL=(38.0, 0.0), HOLD=50, LENGTH=6, PLANNED_DENSE=2, PLANNED_SPARSE=2, EPISODE=600),
     "obstacles": dict(WALLS=HULL + [(7, 9, 2.5, 4.5), (13, 15, 10, 12), (12, 14, 0, 2), (2, 4, 7, 9)],
                       GOAL=(17.0, 8.0), HOLD=50, LENGTH=5, PLANNED_DENSE=1, PLANNED_SPARSE=1, EPISODE=250),
+    "open": dict(WALLS=[]),
 }
 
 
@@ -140,11 +149,13 @@ def plan(u, kind, samples, horizon, pool, s0):
 
 def run(u):
     """Algorithm 2 for all cases and trials of a unit. Returns rows for the CSV and, for figures, of trials 0
-    to 2 of each case the poses (steps + 1, nq) and for each decision its step and its path (H_P T + 1, 2)."""
+    to 2 of each case the poses (steps + 1, nq) and for each decision its step and its path (H_P T + 1, 2).
+    A robot that MuJoCo finds unstable starts anew at the origin, and its trial counts where it ends."""
     skills = u.episode // (u.hold * u.length)
     ahead = [max(1, steps // (u.hold * u.length)) for steps in u.look_ahead]
-    cases = [(kind, samples, planned) for kind, samples in product(u.rewards, u.samples)
-             for planned in ahead or [dict(dense=u.planned_dense, sparse=u.planned_sparse)[kind]]]
+    cases = list(dict.fromkeys(
+        (kind, samples, min(planned, skills)) for kind, samples in product(u.rewards, u.samples)
+        for planned in ahead or [dict(dense=u.planned_dense, sparse=u.planned_sparse)[kind]]))
     trials = list(product(cases, range(u.trials)))
     robots = common.Robots(maze_spec(u), len(trials), THREADS)
     for ids in np.arange(len(trials)).reshape(len(cases), -1):  # every case has the same starts
@@ -175,7 +186,7 @@ def run(u):
         distance = np.linalg.norm(pose[:, :2] - u.goal, axis=1)
         rows.append(dict(
             maze=u.maze, reward=kind, method=u.method, mode=u.mode,
-            look_ahead=min(planned, skills) * u.hold * u.length, samples=samples, trial=trial, seed=u.seed,
+            look_ahead=planned * u.hold * u.length, samples=samples, trial=trial, seed=u.seed,
             final_distance=distance[-1], min_distance=distance.min(), success=int(distance[-1] < u.epsilon),
             contacts=contacts[n], path_length=np.linalg.norm(np.diff(pose[:, :2], axis=0), axis=1).sum(),
             planning_ms=1e3 * seconds[n] / skills, policy_seed=u.policy_seed, policy=u.policy.sha256[:8],
@@ -188,6 +199,8 @@ def run(u):
 def main():
     units = units_of(*common.parse_flags(globals()))
     torch.set_num_threads(THREADS)
+    if DRIVE:
+        return drive(units[0])
     path, start, examples = Path(OUT) / "results" / f"{EXPERIMENT}.csv", time.time(), []
     for u in units:
         what = f"{u.method} {MODE_WORDS[u.mode]}, {u.maze}, policy seed {u.policy_seed}"
@@ -239,10 +252,103 @@ def collides(path, walls, radius):
     return hit
 
 
+# ---------------------------------------------------------------- driving by hand: not in the paper
+
+def dot(place, colour):
+    """A ball on the floor at place (2,), metres, for MuJoCo's renderers."""
+    geom = mujoco.MjvGeom()
+    mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.1), np.array([*place, 0.1]),
+                        np.eye(3).ravel(), np.float32([*to_rgb(colour), 1]))
+    return geom
+
+
+def drive(u):
+    """Sliders in a web page command the Ant in real time. mujoco serves the page, to this machine alone."""
+    robots, model, pages, trail = common.Robots(maze_spec(u), 1), maze_spec(u).compile(), [], []
+    robots.qpos[0, :2] += u.start
+    names, steps, asked, pool = ["z_" + name for name in u.policy.names], 0, None, skill_pool(u)
+    hand = SimpleNamespace(mode="stand still", z=dict.fromkeys(names, 0.0), closed=True, text="", geoms=[])
+    start = due = time.monotonic()
+    try:
+        from mujoco.studio import launch_web, messages, plugin, viewer_protocol, web_viewer
+        from mujoco.studio.dear_imgui import dear_imgui as gui
+
+        class Panel(plugin.ViewerPlugin):  # the viewer's thread calls it, 60 times a second, page or no page
+            @messages.handler
+            def look(self, event: messages.PostModelEvent):
+                host, port = self.viewer._http_sock.getsockname()[:2]
+                if host != "127.0.0.1":
+                    raise RuntimeError("it would listen beyond this machine")
+                camera = self.viewer.camera
+                camera.type, camera.distance = 1, 12  # 1: it follows a body
+                camera.trackbodyid = model.body("torso").id
+                print(f"drive the Ant at http://{host}:{port}/ (Ctrl-C ends it)", flush=True)
+
+            @messages.handler
+            def build(self, event: messages.BuildGuiEvent):
+                gui.Begin("drive the Ant", True, int(gui.WindowFlags.AlwaysAutoResize))
+                z = {name: gui.SliderFloat(name, at, -1.5, 1.5, "%.2f")[1] for name, at in hand.z.items()}
+                if z != hand.z:
+                    hand.z, hand.mode = z, "by hand"
+                for mode in ("stand still", "start again", "plan to the goal"):
+                    if gui.Button(mode):
+                        hand.mode = mode
+                    gui.SameLine()
+                hand.closed = gui.Checkbox("closed loop", hand.closed)[1]
+                gui.TextUnformatted(hand.text)
+                gui.End()
+                self.viewer.extra_geoms[:] = hand.geoms
+
+        # The trap: the viewer asks for no password and listens on every interface. Make that 127.0.0.1.
+        bind = web_viewer.web_server.bind_public_socket
+        web_viewer.web_server.bind_public_socket = lambda host, port: bind("127.0.0.1", port)
+        web_viewer.print = web_viewer._print_url_banner = lambda *words, **options: None
+        logging.getLogger("mujoco.studio").setLevel("CRITICAL")  # its errors are raised as well
+        logging.getLogger("WebServer").addFilter(pages.append)  # who comes and goes; None hides it
+        with launch_web.launch(viewer_protocol.ViewerConfig(http_port=PORT), plugins=[Panel()]) as handle:
+            data = mujoco.MjData(model)
+            handle.set_model(model, data=data)
+            while handle.is_running() and not 0 < SECONDS <= time.monotonic() - start:
+                if pages and "(0 total)" in pages[-1].getMessage() and time.time() > pages[-1].created + 10:
+                    break  # the last page is closed; one that reloads is back sooner
+                if hand.mode == "start again":
+                    hand.mode, asked, trail = "stand still", None, []
+                    robots.reset([0])
+                    robots.qpos[0, :2] += u.start
+                place, mode, z = robots.place()[0], hand.mode, hand.z  # once: the page changes them
+                if mode == "plan to the goal" and math.dist(place, u.goal) < 1:
+                    mode = hand.mode = "stand still"
+                if asked != (mode, z) or age == u.hold * (1 if mode == "plan to the goal" else u.length):
+                    asked, age, reference, going = (mode, z), 0, place, mode != "stand still"
+                    skill = torch.tensor([list(z.values())])
+                    if mode == "plan to the goal":
+                        skill = plan(u, "dense", u.samples[0], u.planned_dense, pool, place)[0][None]
+                    c = going * commands_of(u.policy, skill, u.length)[0].repeat_interleave(u.hold, 0)
+                command, error = c[age][None], (reference - place).norm()
+                if hand.closed:
+                    command = common.closed_loop(command, reference[None], robots, u.policy.scale)
+                robots.step(u.policy.actor.act(robots.observe(), command, deterministic=True).numpy())
+                hand.text = f"command {command.norm():.2f} of 1, tracking error {error:.2f} m"
+                age, steps, reference = age + 1, steps + 1, reference + u.policy.scale * c[age]
+                if steps % 10 == 0:
+                    trail = [*trail[-200:], dot(place, RED)]
+                ahead = place + u.policy.scale * c.roll(-age, 0).cumsum(0)  # the skill is repeated
+                hand.geoms = trail + [dot(there, BLUE) for there in ahead[::10]]
+                data.qpos[:] = robots.qpos[0]
+                handle.sync()
+                due = max(due + 0.05, time.monotonic() - 0.5)  # after a pause it does not race
+                time.sleep(max(0, due - time.monotonic()))
+    except KeyboardInterrupt:
+        pass
+    except (ImportError, AttributeError, TypeError, RuntimeError, OverflowError) as error:
+        stop(f"cannot drive in a browser with mujoco {mujoco.__version__} at --port {PORT}: {error}")
+    print(f"{steps} steps, {steps / (time.monotonic() - start):.2f} a second")
+
+
 # ---------------------------------------------------------------- what is planned: rows, flags, checks
 
 MODE_WORDS = dict(printed="as printed", closed="closed loop")
-OF_A_RUN = "EXPERIMENT OUT THREADS DRAW METHOD MAZES".split()  # no row of MAZE or METHODS sets these
+OF_A_RUN = "EXPERIMENT OUT THREADS DRAW METHOD MAZES DRIVE SECONDS PORT".split()  # no other row sets these
 load_once, print_once = cache(common.load_policy), cache(print)
 
 

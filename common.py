@@ -1,8 +1,8 @@
 """What two or more stages share, in the order in which a reader meets it:
-command line -> artifacts and CSV -> weak labels and factors -> decoder -> robot -> actor -> execution -> plots.
+command line, artifacts and CSV, weak labels and factors, decoder, robot, actor, execution, plots.
 
-Units: trajectory units for decoder displacements (one transition is at most 1), metres and radians in the world,
-`scale` metres per trajectory unit and environment step for a robot, 0.05 s per environment step.
+Units: trajectory units for decoder displacements (one transition is at most 1), metres and radians in the
+world, `scale` metres per trajectory unit and environment step, 0.05 s per environment step.
 """
 import argparse
 import ast
@@ -20,8 +20,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 os.environ["MPLBACKEND"] = "Agg"  # figures are files; a notebook's backend would fail here
-if sys.platform == "linux" and "MUJOCO_GL" not in os.environ:  # set before mujoco loads: GLFW aborts without a screen
-    os.environ["MUJOCO_GL"] = "egl" if ctypes.util.find_library("EGL") else "disable"
+if sys.platform == "linux":  # before mujoco loads: GLFW aborts without a screen
+    os.environ.setdefault("MUJOCO_GL", "egl" if ctypes.util.find_library("EGL") else "disable")
 
 import matplotlib.pyplot as plt
 import mujoco
@@ -29,11 +29,7 @@ import numpy as np
 import torch
 from mujoco.batch import Batch
 from torch import nn
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
+from torch.utils._pytree import tree_leaves
 
 HERE = Path(__file__).parent
 FORMAT = 3  # of the artifacts; raise it when the meaning of what is stored changes
@@ -49,66 +45,53 @@ def stop(message, code=2):
 
 
 def convert(value, like, negative, name):
-    """value (text of a flag, or what a row of a table holds) -> the type of `like`. Exits with 2 if it does not fit."""
-    kind = type(like)
+    """value (a flag's text, or an entry of a row) -> the type of `like`. Exits with 2 if it does not fit."""
+    size = np.size(like)
     try:
-        if kind is bool:
-            result = {"true": True, "false": False}[str(value).lower()]
-        elif kind is tuple:
-            result = tuple(float(part) for part in (value.split() if isinstance(value, str) else value))
-            if len(result) != len(like) or not np.isfinite(result).all():
-                raise ValueError
-        elif kind in (int, float):
-            result = float(value)
-            if not math.isfinite(result) or (result < 0 and not negative):
-                raise ValueError
-            if kind is int:
-                result = int(result) if result.is_integer() else int("not whole")
-        else:
-            result = str(value)
+        if isinstance(like, bool):
+            return {"true": True, "false": False}[str(value).lower()]
+        if isinstance(like, str):
+            return str(value)
+        parts = value.split() if isinstance(value, str) else np.atleast_1d(value)
+        numbers = [float(part) for part in parts]
+        fits = len(numbers) == size and all(map(math.isfinite, numbers))
+        whole = not isinstance(like, int) or numbers[0].is_integer()
+        if fits and whole and (negative or min(numbers) >= 0):
+            return tuple(numbers) if isinstance(like, tuple) else type(like)(numbers[0])
     except (KeyError, TypeError, ValueError):
-        wanted = {bool: "true or false", int: "a whole number", float: "a number", tuple: f"{len(like)} numbers"
-                  if kind is tuple else ""}[kind]
-        stop(f"{name} is {value!r}, but must be {wanted}{'' if negative or kind is bool else ', 0 or more'}")
-    return result
+        pass
+    kinds = {bool: "true or false", int: "a whole number", float: "a number", tuple: f"{size} numbers"}
+    limit = "" if negative or isinstance(like, bool) else ", 0 or more"
+    stop(f"{name} is {value!r}, but must be {kinds[type(like)]}{limit}")
 
 
 def parse_flags(stage, argv=None):
-    """Make each `NAME = value  # comment` at the top of a stage a flag --name, and set the stage's globals from it.
-
-    stage: the script's globals(). A row of its table EXPERIMENTS overrides constants by name; a flag overrides both.
-    Returns the configuration {NAME: value} and what flags alone say {NAME: value}. Exits with 2 and one line if a flag,
-    a row or a type is wrong, or if nothing can be written to OUT.
-    """
+    """Make each `NAME = value # comment` at the top of a stage (its globals()) a flag --name, and set it. A
+    row of EXPERIMENTS overrides constants, a flag both. Returns {NAME: value}, and the same of the flags
+    alone. Exits with 2 if a flag, a row, a type or OUT is wrong."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     if hasattr(signal, "SIGPIPE"):
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # piped into head: end as other programs do
     sys.excepthook = one_line_when_stopped
     source = Path(stage["__file__"]).read_text(encoding="utf-8")
-    lines = source.splitlines()
-    comments = {}
-    for node in ast.parse(source).body:
-        name = getattr(node.targets[0], "id", "") if isinstance(node, ast.Assign) else ""
-        if name.isupper() and type(stage[name]) in (bool, int, float, str, tuple):
-            comments[name] = lines[node.end_lineno - 1].partition("  # ")[2]
-            if "e" in ast.unparse(node.value) or "." not in ast.get_source_segment(source, node.value):
-                if isinstance(stage[name], float) and stage[name].is_integer():
-                    stage[name] = int(stage[name])  # 1e4 means ten thousand
-    rows = stage["EXPERIMENTS"]
-    negative = {name: isinstance(stage[name], tuple) or any(
-        isinstance(value, (int, float)) and value < 0 for value in [stage[name], *(row.get(name) for row in rows.values())])
-        for name in comments}
-
     parser = argparse.ArgumentParser(description=stage["__doc__"], allow_abbrev=False,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.error = lambda message: stop(f"{message}; see --help")
-    for name, comment in comments.items():
-        shown = " ".join(f"{part:g}" for part in stage[name]) if isinstance(stage[name], tuple) else stage[name]
+    rows, negative = stage["EXPERIMENTS"], {}
+    for node in ast.parse(source).body:
+        name = getattr(node.targets[0], "id", "") if isinstance(node, ast.Assign) else ""
+        if not name.isupper() or not isinstance(stage[name], (bool, int, float, str, tuple)):
+            continue
+        text, _, comment = source.splitlines()[node.end_lineno - 1].partition("  # ")
+        if isinstance(stage[name], float) and stage[name].is_integer() and "." not in text:
+            stage[name] = int(stage[name])  # 1e4 means ten thousand
+        values = [stage[name]] + [row.get(name) for row in rows.values()]
+        negative[name] = any(isinstance(v, tuple) or isinstance(v, (int, float)) and v < 0 for v in values)
         parser.add_argument("--" + name.lower(), dest=name, metavar=type(stage[name]).__name__,
-                            help=f"{comment} [{shown}]".replace("%", "%%"))
+                            help=f"{comment} [{stage[name]}]".replace("%", "%%"))
     parsed, unknown = parser.parse_known_args(argv)
     if unknown:
-        stop(f"unknown flag {unknown[0]}; allowed: {' '.join('--' + name.lower() for name in comments)}")
+        stop(f"unknown flag {unknown[0]}; allowed: {' '.join('--' + name.lower() for name in negative)}")
     given = {name: convert(value, stage[name], negative[name], "--" + name.lower())
              for name, value in vars(parsed).items() if value is not None}
     experiment = given.get("EXPERIMENT", stage["EXPERIMENT"])
@@ -117,38 +100,35 @@ def parse_flags(stage, argv=None):
     for name, value in rows[experiment].items():
         if name not in stage:
             stop(f"the row {experiment!r} of EXPERIMENTS names {name}, which is no constant of this file")
-        if name in comments:
-            value = convert(value, stage[name], negative[name], f"{name} in the row {experiment!r} of EXPERIMENTS")
-        stage[name] = value
-    stage["EXPERIMENT"] = experiment
+        where = f"{name} in the row {experiment!r} of EXPERIMENTS"
+        stage[name] = convert(value, stage[name], negative[name], where) if name in negative else value
     stage.update(given)
     write_whole(Path(stage["OUT"]) / f".can_write_{os.getpid()}", b"").unlink()  # before any work is lost
-    return {name: stage[name] for name in comments}, given
+    return {name: stage[name] for name in negative}, given
 
 
 def one_line_when_stopped(kind, error, trace):
-    if kind is KeyboardInterrupt:
-        print("\nstopped; what was saved stays, and --resume true goes on from the last checkpoint", file=sys.stderr)
-    else:
-        sys.__excepthook__(kind, error, trace)
+    if kind is not KeyboardInterrupt:
+        return sys.__excepthook__(kind, error, trace)
+    print("\nstopped; what was saved stays; --resume true goes on from the last checkpoint", file=sys.stderr)
 
 
 # ---------------------------------------------------------------- artifacts and CSV
 
 def write_whole(path, data):
-    """Write bytes to path, whole or not at all, under a name that no other process uses. Returns the path."""
+    """Write bytes to path, whole or not at all, under a name that no other process uses. Returns path."""
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(partial, "wb") as file:
             file.write(data)
             file.flush()
-            os.fsync(file.fileno())  # on the disk before it takes the name: a power cut leaves no empty artifact
+            os.fsync(file.fileno())  # before it takes the name: a power cut leaves no empty artifact
         os.replace(partial, path)  # atomic
     except OSError as error:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
-        stop(f"cannot write {path}: {error.strerror}; free the space or choose another place with --out", code=1)
+        stop(f"cannot write {path}: {error.strerror}; free the space or choose another --out", code=1)
     return path
 
 
@@ -157,8 +137,8 @@ def artifact_name(kind, experiment, seed):
 
 
 def save(out, kind, experiment, seed, config, **content):
-    """Write <out>/<kind>_<experiment>_seed<seed>. content: arrays (.npz) or tensors and plain values (.pt).
-    The last 32 bytes are the SHA-256 of all bytes before them; numpy and torch read over them."""
+    """Write <out>/<kind>_<experiment>_seed<seed>; content: arrays (.npz), or tensors and plain values (.pt).
+    The last 32 bytes are the SHA-256 of all bytes before them."""
     meta = dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed, config=config,
                 versions=dict(torch=str(torch.__version__), mujoco=mujoco.__version__, numpy=np.__version__))
     buffer = io.BytesIO()
@@ -167,82 +147,69 @@ def save(out, kind, experiment, seed, config, **content):
     else:
         torch.save(meta | content, buffer)
     data = buffer.getvalue()
-    return write_whole(Path(out) / artifact_name(kind, experiment, seed), data + hashlib.sha256(data).digest())
+    path = Path(out) / artifact_name(kind, experiment, seed)
+    return write_whole(path, data + hashlib.sha256(data).digest())
 
 
 def load(out, kind, experiment, seed, quiet=False):
-    """Read an artifact from <out>/, else pretrained/, and say which. Returns its content, with "sha256" (hex digits).
-    Exits with 2 and one line if it is missing, damaged, foreign or not finite."""
+    """Read an artifact from <out>/, else pretrained/, and say which. Returns its content and "sha256" (hex
+    digits). Exits with 2 and one line if it is missing, damaged, foreign or not finite."""
     name = artifact_name(kind, experiment, seed)
     make = f"make it with: python {SCRIPT[kind.partition('-')[0]]} --experiment {experiment} --seed {seed}"
-    path = next((p for p in (Path(out) / name, HERE / "pretrained" / name) if p.exists()), None)
-    if path is None:
+    paths = [path for path in (Path(out) / name, HERE / "pretrained" / name) if path.exists()]
+    if not paths:
         stop(f"no {name} in {out}/ or pretrained/; {make}")
+    path = paths[0]
     try:
         data = path.read_bytes()
-        sound = hashlib.sha256(data[:-32]).digest() == data[-32:]
+        if hashlib.sha256(data[:-32]).digest() != data[-32:]:
+            raise ValueError
         if kind == "dataset":
             with np.load(io.BytesIO(data), allow_pickle=False) as file:
                 content = {key: file[key] for key in file.files}
             content |= json.loads(str(content.pop("meta")))
         else:
             content = torch.load(io.BytesIO(data[:-32]), weights_only=True)
-        found = {key: content.get(key) for key in ("format", "kind", "experiment", "seed")}
-    except Exception:  # numpy, zipfile, json and torch raise a dozen kinds on a damaged file; all mean the same
+    except Exception:  # numpy, zipfile and torch raise a dozen kinds on a damaged file; all mean the same
         stop(f"{path} is damaged or is no artifact of this project; {make}")
     for key, needed in dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed).items():
-        if found[key] != needed:
-            stop(f"{path} has {key} {found[key]!r} where {needed!r} is needed; {make}")
-    if not sound:
-        stop(f"{path} is damaged (its checksum does not match); {make}")
-    if not all(np.isfinite(leaf).all() for leaf in numbers_in(content)):
+        if content[key] != needed:
+            stop(f"{path} has {key} {content[key]!r} where {needed!r} is needed; {make}")
+    kinds = (float, np.ndarray, torch.Tensor)
+    leaves = [np.asarray(leaf) for leaf in tree_leaves(content) if isinstance(leaf, kinds)]
+    if not all(np.isfinite(leaf).all() for leaf in leaves if leaf.dtype.kind == "f"):  # not for text
         stop(f"{path} holds numbers that are not finite; {make}")
     if not quiet:
         print(f"using {path.relative_to(HERE) if path.is_relative_to(HERE) else path}")
     return content | dict(sha256=data[-32:].hex())
 
 
-def numbers_in(content):
-    """Every array of floating-point numbers in an artifact."""
-    if isinstance(content, dict):
-        content = list(content.values())
-    if isinstance(content, (list, tuple)):
-        for part in content:
-            yield from numbers_in(part)
-    elif isinstance(content, (np.ndarray, torch.Tensor)):
-        array = np.asarray(content)
-        if array.dtype.kind == "f":
-            yield array
-
-
 def check_same(artifact, config, free):
-    """Exit with 2 unless an artifact was made with today's value of each constant that is not named in free."""
+    """Exit with 2 unless an artifact has today's value of each constant that is not named in free."""
+    made = artifact["config"]
     for name in sorted(set(config) - set(free)):
-        if artifact["config"].get(name) != config[name]:
-            stop(f"{artifact['kind']} {artifact['experiment']} was made with {name} = {artifact['config'].get(name)}, not "
+        if made.get(name) != config[name]:
+            stop(f"{artifact['kind']} {artifact['experiment']} was made with {name} = {made.get(name)}, not "
                  f"{config[name]}: give the same, or train anew")
 
 
-@contextlib.contextmanager
-def locked(path):
-    """One process at a time: seeds trained side by side write rows into one file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path.with_name(path.name + ".lock"), "w") as file:
-        if fcntl:
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 def update_csv(path, rows, key):
     """Write rows (dicts), in place of those in the file that agree with one of them on the columns in key."""
     new = [{k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in row.items()} for row in rows]
     replaced = {tuple(row[k] for k in key) for row in new}
-    with locked(path):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(f"{path}.lock", "w") as lock:  # one process at a time: seeds trained side by side share a file
+        if os.name == "posix":  # Windows has no fcntl
+            import fcntl
+            fcntl.flock(lock, fcntl.LOCK_EX)
         old = read_csv(path) if path.exists() else []
+        kept = [row for row in old if tuple(row.get(k) for k in key) not in replaced]
         text = io.StringIO()
         writer = csv.DictWriter(text, list(new[0]), extrasaction="ignore", restval="", lineterminator="\n")
         writer.writeheader()
-        writer.writerows([row for row in old if tuple(row.get(k) for k in key) not in replaced] + new)
+        writer.writerows(kept + new)
         write_whole(path, text.getvalue().encode())
 
 
@@ -255,13 +222,12 @@ def read_csv(path):
 
 SINGLE = ("speed", "direction")          # factors of z_single, Sec. 4.2.2: they act in each transition
 MULTI = ("curvature", "acceleration")    # factors of z_multi: they act over several transitions
-CLASSES = dict(speed=4, direction=4, curvature=3, acceleration=3, x=4, y=4)  # of each weak label, App. A.1.1, A.3.1
+CLASSES = dict(speed=4, direction=4, curvature=3, acceleration=3, x=4, y=4)  # of labels, App. A.1.1, A.3.1
 
 
 def weak_labels(factors, names, ranges):
-    """Weak labels, App. A.1.1, A.3.1 and Fig 9. factors: {name: (N,)}, ranges: {name: (low, high)}. Returns (N, M)
-    int64 classes, from 0 (the paper: from 1). Curvature and acceleration: none, positive, negative; the others: four
-    equal segments of their range, of direction from the left downwards."""
+    """Weak labels, App. A.1.1, A.3.1, Fig 9: factors {name: (N,)}, ranges {name: (low, high)} -> (N, M) int64
+    classes from 0. Curvature, acceleration: none, positive, negative; the others: quarters of their range."""
     labels = []
     for name in names:
         if name in MULTI:
@@ -269,7 +235,7 @@ def weak_labels(factors, names, ranges):
         else:
             low, high = ranges[name]
             share = (factors[name] - low) / (high - low)
-            if name == "direction":
+            if name == "direction":  # from the left downwards
                 share = 1 - share
             label = np.clip(np.floor(CLASSES[name] * share), 0, CLASSES[name] - 1)
         labels.append(label.astype(np.int64))
@@ -277,11 +243,9 @@ def weak_labels(factors, names, ranges):
 
 
 def factors_of(displacement, names):
-    """The factors in names of trajectories, from their transitions: displacement (N, T, 2 or 1) -> {name: (N,)}.
-
-    Speed in the unit of the displacement (with a sign in one dimension), direction of the first transition in
-    radians, curvature in radians per transition, x and y of the mean transition, acceleration as a share of the
-    speed per transition (of 0.1 at least: standing still is noise); beside it, speed is that of the first one."""
+    """The factors in names of trajectories: displacement (N, T, 2 or 1) -> {name: (N,)}. Speed: the mean
+    (with acceleration: the first), on a rail with a sign; direction: the first, radians; curvature: radians
+    per transition; x, y: the mean; acceleration: per transition, as a share of the speed."""
     steps = displacement.shape[1]
     size = np.linalg.norm(displacement, axis=2) if displacement.shape[2] == 2 else displacement[..., 0]
     found = dict(speed=size.mean(1))
@@ -298,7 +262,7 @@ def factors_of(displacement, names):
 
 
 def spread(values, name):
-    """How far a factor (n,) ranges; of directions, which close in a circle, all of it but the largest gap."""
+    """Range of a factor's values (n,); of directions, which close in a circle, all but the largest gap."""
     if name != "direction":
         return np.ptp(values)
     angles = np.sort(values % (2 * math.pi))
@@ -306,8 +270,8 @@ def spread(values, name):
 
 
 def cross_talk(curves, ranges):
-    """C[i, j] = range of factor j while axis i is traversed / its range in the data, (axes, factors). curves: of each
-    axis the factors {name: (n,)} along its traversal; ranges: {name: (low, high)} of the data."""
+    """Cross-talk C (axes, factors): range of factor j along axis i / its range in the data. curves: for each
+    axis the factors {name: (n,)} along its traversal; ranges: {name: (low, high)}."""
     return np.array([[spread(curve[name], name) / np.ptp(limits) for name, limits in ranges.items()]
                      for curve in curves])
 
@@ -319,12 +283,16 @@ def purity(C, i, j):
 
 # ---------------------------------------------------------------- the decoder: predictive model and reward
 
-class Decoder(nn.Module):
-    """p_theta(tau | z), Fig 1: an LSTM that reads z and its own last mean, and gives a Gaussian over the next displacement.
+def layers(n_in, hidden, n_out):
+    """Two hidden layers with ReLU."""
+    return nn.Sequential(nn.Linear(n_in, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
+                         nn.Linear(hidden, n_out))
 
-    The trap: with the true last displacement as input, noise-free trajectories give their factors away after two steps,
-    z is not needed and stays entangled. So the decoder never reads the truth, in training either.
-    circle: index of a latent that is an angle, of which -1.5 and 1.5 are the same; the LSTM reads its cosine and sine."""
+
+class Decoder(nn.Module):
+    """p_theta(tau | z), Fig 1: an LSTM over z and its own last mean -> a Gaussian over the next displacement.
+    The trap: a decoder that reads the true last displacement needs no z, and z stays entangled. circle: index
+    of a latent that is an angle, of which -1.5 and 1.5 are the same."""
 
     def __init__(self, z_dim, x_dim, hidden, circle=None):
         super().__init__()
@@ -332,13 +300,14 @@ class Decoder(nn.Module):
         self.x_dim, self.circle = x_dim, circle
         self.cell = nn.LSTMCell(x_dim + z_dim + (circle is not None), hidden)
         self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2 * x_dim))
-        self.register_buffer("axes", torch.eye(z_dim))  # canonical z -> latents of training: a signed permutation
+        self.register_buffer("axes", torch.eye(z_dim))  # canonical z -> latents: a signed permutation
 
     def unroll(self, latents, steps):
-        """Latents of training (B, M) -> mean and log-variance of the displacements, (B, steps, x_dim) each."""
+        """Latents of training (B, M) -> mean and log-variance of displacements, (B, steps, x_dim) each."""
         read = latents
-        if self.circle is not None:
-            read = torch.cat([latents[:, :self.circle], on_circle(latents[:, self.circle]), latents[:, self.circle + 1:]], 1)
+        i = self.circle
+        if i is not None:
+            read = torch.cat([latents[:, :i], on_circle(latents[:, i]), latents[:, i + 1:]], 1)
         mean = latents.new_zeros(len(latents), self.x_dim)
         state, means, log_vars = None, [], []
         for _ in range(steps):
@@ -359,14 +328,14 @@ def on_circle(z):
 
 
 class SkillDynamics(nn.Module):
-    """q_phi(displacement | z) of DADS: a mixture of Gaussians with unit covariance on normalised displacements. Without the
-    place nothing of the state is left for it to read, so it reads z alone. Displacements in trajectory units."""
+    """q_phi(displacement | z) of DADS: a mixture of Gaussians with unit covariance on normalised
+    displacements. It reads z alone: without the place, nothing of the state is left for it."""
 
     def __init__(self, z_dim=2, x_dim=2, hidden=512, components=4):
         super().__init__()
-        self.arguments, self.x_dim = (z_dim, x_dim, hidden, components), x_dim
-        self.net = nn.Sequential(nn.Linear(z_dim, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
-                                 nn.Linear(hidden, components * (1 + x_dim)))
+        self.arguments = (z_dim, x_dim, hidden, components)
+        self.x_dim = x_dim
+        self.net = layers(z_dim, hidden, components * (1 + x_dim))
         self.register_buffer("x_mean", torch.zeros(x_dim))
         self.register_buffer("x_std", torch.ones(x_dim))
 
@@ -376,7 +345,8 @@ class SkillDynamics(nn.Module):
         return logit.squeeze(2).log_softmax(1), mean
 
     def forward(self, z, steps):
-        """As Decoder: the mean displacement, the same at each step, (B, steps, x_dim); no log-variance, it is a mixture's."""
+        """As Decoder: the mean displacement, at each step the same, (B, steps, x_dim), and no
+        log-variance."""
         log_weight, mean = self.mixture(z)
         mean = self.x_mean + self.x_std * (log_weight.exp()[..., None] * mean).sum(1)
         return mean[:, None].expand(-1, steps, -1), None
@@ -388,30 +358,28 @@ def pack(module):
 
 
 def unpack(packed):
-    module = {one.__name__: one for one in (Decoder, SkillDynamics, Actor)}[packed["network"]](*packed["arguments"])
+    kinds = dict(Decoder=Decoder, SkillDynamics=SkillDynamics, Actor=Actor)
+    module = kinds[packed["network"]](*packed["arguments"])
     module.load_state_dict(packed["state"])
     return module.requires_grad_(False)
 
 
 def next_skill(z, names, relation):
-    """The relation functions f, Sec. 4.2.2, 6.1.2 and A.3.2: z (..., M) of one transition -> of the next.
-
-    names: the factor of each axis; relation: {factor of z_multi: weight}. The paper tunes the weights by hand (-0.2 and 0.1,
-    signs by the axes of its training); 03 calibrates them from the decoder."""
+    """The relation functions f, Sec. 4.2.2, 6.1.2, A.3.2: z (..., M) of one transition -> of the next. names:
+    of the axes; relation: {factor of z_multi: weight} (the paper, by hand: -0.2, 0.1; 03: from the
+    decoder)."""
     z = z.clone()
     for factor, weight in relation.items():
         change = weight * z[..., names.index(factor)]
-        if factor == "curvature":
-            z[..., names.index("direction")] += change  # f_dir
-        elif "direction" in names:
-            z[..., names.index("speed")] += change  # f_speed, two dimensions
-        else:
-            z[..., names.index("speed")] += change * z[..., names.index("speed")].sign()  # f_speed of App. A.3.2
+        target = z[..., names.index("direction" if factor == "curvature" else "speed")]  # a view
+        if factor == "acceleration" and "direction" not in names:
+            change = change * target.sign()  # f_speed of App. A.3.2: on a rail a speed has a sign
+        target += change  # f_dir or f_speed
     return z
 
 
 def first_step(decoder, z_single):
-    """Mean and log-variance (B, x_dim) of the decoder's first step for z = (z_single, 0): p_theta(s_1 | z), Sec. 6.1.2."""
+    """p_theta(s_1 | z) for z = (z_single, 0), Sec. 6.1.2: mean and log-variance (B, x_dim)."""
     z = nn.functional.pad(z_single, (0, len(decoder.axes) - z_single.shape[1]))
     mean, log_var = decoder(z, 1)
     return mean[:, 0], log_var[:, 0]
@@ -419,10 +387,8 @@ def first_step(decoder, z_single):
 
 @torch.no_grad()
 def commands_of(policy, z, steps):
-    """The commands of skills z (B, M): displacements (B, `steps`, c_dim) in trajectory units.
-
-    WEDIS: the decoder's first step for z_single, `steps` (T) times, with z_single changed by the relation functions in
-    between. SeCTAR: its decoder's T steps. DADS: z itself, whatever it means."""
+    """The commands of skills z (B, M): (B, `steps`, c_dim) in trajectory units. WEDIS: first steps of the
+    decoder, with relation functions in between; SeCTAR: its decoder's steps; DADS: z itself."""
     if isinstance(policy.decoder, SkillDynamics):
         return z[:, None].expand(-1, steps, -1)
     if not policy.names:
@@ -438,69 +404,29 @@ def commands_of(policy, z, steps):
 # ---------------------------------------------------------------- the robot
 
 FRAME_SKIP = 5  # physics steps of 0.01 s per environment step
-REST = (0, 0, 0.55, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1)  # the pose that the Ant's model file calls init_qpos
 
 
 def ant_spec():
-    """The Ant of the MuJoCo benchmarks (8 hinges, 13 bodies), built in code. nq 15, nv 14, nu 8, RK4 at 0.01 s."""
-    spec = mujoco.MjSpec()
-    spec.modelname, spec.compiler.degree = "ant", True
-    spec.option.integrator, spec.option.timestep = mujoco.mjtIntegrator.mjINT_RK4, 0.01
-    joint, geom = spec.default.joint, spec.default.geom
-    joint.armature, joint.damping, joint.limited = 1, [1, 0, 0], True
-    geom.density, geom.friction, geom.margin, geom.rgba = 5, [1, 0.5, 0.5], 0.01, [0.8, 0.6, 0.4, 1]
-    geom.condim, geom.conaffinity = 3, 0  # contype 1 against conaffinity 0: legs do not collide with one another
-    capsule = dict(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[0.08, 0, 0])
-
-    world = spec.worldbody
-    world.add_light(pos=[0, 0, 1.3], dir=[0.2, 0.2, -1], diffuse=[0.8, 0.8, 0.8],
-                    type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-    spec.visual.headlight.diffuse = [0.3, 0.3, 0.3]
-    spec.add_texture(name="tiles", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-                     width=64, height=64, rgb1=[0.86, 0.89, 0.86], rgb2=[0.78, 0.82, 0.79])
-    tiles = spec.add_material(name="tiles", texrepeat=[0.5, 0.5], texuniform=True)
-    tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
-    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[40, 40, 40], conaffinity=1, material="tiles",
-                   rgba=[1, 1, 1, 1])
-    torso = world.add_body(name="torso", pos=[0, 0, 0.75])
-    torso.add_freejoint(name="root").margin = 0.01
-    torso.add_geom(name="torso_geom", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.25, 0, 0])
-    legs = [("1", 1, 1, [-1, 1, 0], [30, 70]), ("2", -1, 1, [1, 1, 0], [-70, -30]),
-            ("3", -1, -1, [-1, 1, 0], [-70, -30]), ("4", 1, -1, [1, 1, 0], [30, 70])]
-    for name, x, y, axis, bend in legs:
-        leg = torso.add_body(name="leg_" + name)
-        leg.add_geom(name="aux_" + name, fromto=[0, 0, 0, 0.2 * x, 0.2 * y, 0], **capsule)
-        thigh = leg.add_body(name="thigh_" + name, pos=[0.2 * x, 0.2 * y, 0])
-        thigh.add_joint(name="hip_" + name, axis=[0, 0, 1], range=[-30, 30])
-        thigh.add_geom(name="thigh_" + name, fromto=[0, 0, 0, 0.2 * x, 0.2 * y, 0], **capsule)
-        shin = thigh.add_body(name="shin_" + name, pos=[0.2 * x, 0.2 * y, 0])
-        shin.add_joint(name="ankle_" + name, axis=axis, range=bend)
-        shin.add_geom(name="shin_" + name, fromto=[0, 0, 0, 0.4 * x, 0.4 * y, 0], **capsule)
-    for name in "4123":  # the order of the benchmark's actuators
-        for part in ("hip_", "ankle_"):
-            motor = spec.add_actuator(name=part + name, target=part + name, trntype=mujoco.mjtTrn.mjTRN_JOINT,
-                                      ctrllimited=True, ctrlrange=[-1, 1])
-            motor.set_to_motor()
-            motor.gear[0] = 150
-    spec.add_key(name="rest", qpos=REST)
-    return spec
+    """The Ant of the MuJoCo benchmarks: nq 15, nv 14, nu 8. A spec can still be changed: 04 adds walls."""
+    return mujoco.MjSpec.from_file(str(HERE / "ant.xml"))
 
 
 class Robots:
-    """n robots of one model that step together on threads; equal to a loop over mj_step (mujoco.batch). A robot that is
-    free in space has two coordinates of place, x and y; one on a rail has x alone."""
+    """n robots of one model that step together on threads; equal to a loop over mj_step (mujoco.batch). In
+    the plane a robot has the places x and y, on a rail x alone."""
 
     def __init__(self, spec, n, threads=2):
         model = spec.compile()
         self.batch = Batch(model, n, threads)
         self.places = 2 if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE else 1
         self.rest = model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
-        self.qpos, self.qvel, self.ctrl, self.time = map(self.batch.bind, ("qpos", "qvel", "ctrl", "time"))  # live views
+        views = map(self.batch.bind, ("qpos", "qvel", "ctrl", "time"))  # of MuJoCo's own arrays
+        self.qpos, self.qvel, self.ctrl, self.time = views
         self.reset(np.arange(n))
 
     def reset(self, ids, rng=None, noise=0.1):
-        """Put robots ids at the origin in the rest pose; with rng add U(-noise, noise) to positions, N(0, noise) to
-        velocities."""
+        """Robots ids at the origin at rest; with rng, U(-noise, noise) is added to qpos, N(0, noise) to
+        qvel."""
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)  # also clears the solver's warm start
         self.qpos[ids] = self.rest
         self.time[ids] = 1.0  # clocks start at 1 s, MuJoCo's own reset of an unstable simulation at 0
@@ -509,7 +435,7 @@ class Robots:
             self.qvel[ids] = rng.normal(0, noise, (len(ids), self.qvel.shape[1]))
 
     def place(self):
-        """x and y, or x alone, in metres: (n, 2 or 1). Float32."""
+        """Places (n, 2 or 1) in metres. Float32."""
         return torch.from_numpy(self.qpos[:, :self.places].astype(np.float32))
 
     def age(self):
@@ -517,18 +443,19 @@ class Robots:
         return torch.from_numpy((self.time.reshape(-1, 1) - 1.0).astype(np.float32)) / 0.05
 
     def observe(self):
-        """The policy's state: qpos without the place (App. A.1.3), qvel. Ant (n, 27), Half-Cheetah (n, 17). Float32."""
+        """The policy's state, App. A.1.3: qpos without the place, qvel. (n, 27), Half-Cheetah (n, 17)."""
         return torch.from_numpy(np.concatenate([self.qpos[:, self.places:], self.qvel], 1).astype(np.float32))
 
     def upside_down(self):
         """Which robots have turned over (n,): the torso's z axis points down."""
-        if self.places == 2:
-            return (self.qpos[:, 4:6] ** 2).sum(1) > 0.5  # from its quaternion: 1 - 2 (x^2 + y^2) < 0
-        return np.cos(self.qpos[:, 2]) < 0
+        if self.places == 1:
+            return np.cos(self.qpos[:, 2]) < 0
+        return (self.qpos[:, 4:6] ** 2).sum(1) > 0.5  # of its quaternion: 1 - 2 (x^2 + y^2) < 0
 
     def step(self, action):
-        """One environment step of 0.05 s. action (n, nu) in [-1, 1]. Returns displacement (n, 2 or 1) in metres and which
-        simulations MuJoCo found unstable (n,): it has reset those, so that their displacement means nothing."""
+        """One environment step of 0.05 s. action (n, nu) in [-1, 1]. Returns displacement (n, 2 or 1) in
+        metres and which robots are unstable (n,): MuJoCo resets those, and their displacement means
+        nothing."""
         before, clock = self.qpos[:, :self.places].copy(), self.time.copy()
         self.ctrl[:] = action
         self.batch.step(nstep=FRAME_SKIP)
@@ -545,25 +472,25 @@ def rotate(v, angle):
 
 
 def to_base_frame(s, c):
-    """State (B, 27) of Robots.observe and command (B, 2), turned by the torso's heading -> (B, 26), (B, 2). Physics knows no
-    north: what is learnt for one heading is learnt for all. Angular velocity is the torso's own already."""
-    half = torch.atan2(s[:, 4], s[:, 1])  # half the heading: the quaternion (w, 0, 0, z) of a turn about the vertical
+    """State (B, 27) of Robots.observe and command (B, 2), turned by the torso's heading -> (B, 26), (B, 2).
+    Physics knows no north: what is learnt for one heading is learnt for all."""
+    half = torch.atan2(s[:, 4], s[:, 1])  # half the heading: (w, 0, 0, z) is a turn about the vertical
     upright = torch.hypot(s[:, 1], s[:, 4])[:, None]
     tilt, velocity = rotate(s[:, 2:4], -half), rotate(s[:, 13:15], -2 * half)
-    return torch.cat([s[:, :1], upright, tilt, s[:, 5:13], velocity, s[:, 15:]], 1), rotate(c, -2 * half)
+    body = s[:, 5:13], velocity, s[:, 15:]  # the angular velocity is the torso's own already
+    return torch.cat([s[:, :1], upright, tilt, *body], 1), rotate(c, -2 * half)
 
 
 class Actor(nn.Module):
-    """pi_psi(a | s, c): a Gaussian squashed by tanh. c is the command: the displacement that the decoder predicts for
-    z_single, in trajectory units (the paper: z_single itself, Sec. 4.2.2)."""
+    """pi_psi(a | s, c): a Gaussian squashed by tanh. Command c: the displacement that the decoder predicts
+    for z_single, in trajectory units (the paper: z_single itself, Sec. 4.2.2)."""
 
     def __init__(self, s_dim, c_dim, a_dim, hidden, base_frame):
         super().__init__()
         self.arguments = (s_dim, c_dim, a_dim, hidden, base_frame)
         self.base_frame = base_frame
         s_dim -= base_frame  # a turned quaternion has no fourth number
-        self.net = nn.Sequential(nn.Linear(s_dim + c_dim, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
-                                 nn.Linear(hidden, 2 * a_dim))
+        self.net = layers(s_dim + c_dim, hidden, 2 * a_dim)
         self.register_buffer("s_mean", torch.zeros(s_dim))
         self.register_buffer("s_std", torch.ones(s_dim))
 
@@ -579,7 +506,7 @@ class Actor(nn.Module):
         log_std = log_std.clamp(-5, 2)
         noise = torch.zeros_like(mean) if deterministic else torch.randn_like(mean)
         u = mean + log_std.exp() * noise
-        # log pi(a) = log N(u) - sum log(1 - tanh(u)^2), the last in a form that does not overflow for large |u|
+        # log pi(a) = log N(u) - sum log(1 - tanh(u)^2), in a form that does not overflow for large |u|
         log_prob = -0.5 * noise ** 2 - log_std - 0.5 * math.log(2 * math.pi)
         log_prob = log_prob - 2 * (math.log(2) - u - nn.functional.softplus(-2 * u))
         return torch.tanh(u), log_prob.sum(1)
@@ -590,14 +517,15 @@ class Actor(nn.Module):
         return self(self.inputs(s, c), deterministic)[0]
 
 
-FEEDBACK = 0.1        # closed loop: share of the distance to the reference that is added to each command (the paper: 0)
-CORRECTION = 0.2      # at most so much, trajectory units
-FASTEST = 0.85        # no command is longer, trajectory units; the fastest transition that training asks for is 1
-SOFT_START = 40       # environment steps over which the longest command grows from 0.2 to FASTEST
+FEEDBACK = 0.1     # closed loop: share of the distance to the reference that each command adds (the paper: 0)
+CORRECTION = 0.2   # at most so much, trajectory units
+FASTEST = 0.85     # no command is longer, trajectory units; training asks for transitions up to 1
+SOFT_START = 20    # environment steps over which the longest command grows from 0.2 to FASTEST
 
 
 def closed_loop(c, reference, robots, scale):
-    """The command for a robot that should be at reference (n, 2 or 1), metres, and go on by c (n, 2 or 1), trajectory units."""
+    """Commands of robots that should be at reference (n, 2 or 1), metres, and go on by c (n, 2 or 1),
+    units."""
     correction = FEEDBACK * (reference - robots.place()) / scale
     c = c + correction * (CORRECTION / correction.norm(dim=1, keepdim=True).clamp(min=CORRECTION))
     longest = (0.2 + (FASTEST - 0.2) * robots.age() / SOFT_START).clamp(max=FASTEST)
@@ -605,8 +533,8 @@ def closed_loop(c, reference, robots, scale):
 
 
 def execute(policy, robots, commands, hold, closed, deterministic):
-    """Alg. 2, lines 13-19: hold each command for `hold` (H_z) environment steps. commands (n, T, c_dim) in trajectory units.
-    Yields what Robots.step returns, after each step (for contacts, frames and stopping)."""
+    """Alg. 2, lines 13-19: hold each of the commands (n, T, c_dim), trajectory units, for `hold` (H_z) steps.
+    Yields what Robots.step returns after each (for contacts, frames and stopping)."""
     reference = robots.place()
     for c in commands.unbind(1):
         for _ in range(hold):
@@ -617,15 +545,16 @@ def execute(policy, robots, commands, hold, closed, deterministic):
 
 
 def load_policy(out, experiment, seed, quiet=False):
-    """A policy artifact of 03 as a namespace: networks actor and decoder; method, robot, names (of the axes; [] for DADS and
-    SeCTAR), relation (weights of the relation functions), scale (metres per trajectory unit), and all else that it holds."""
+    """A policy artifact of 03 as a namespace: networks actor and decoder, method, robot, names of the axes
+    ([] for DADS, SeCTAR), relation (weights), scale (metres per trajectory unit), and what else it holds."""
     content = load(out, "policy", experiment, seed, quiet)
-    return SimpleNamespace(**content | dict(actor=unpack(content["actor"]), decoder=unpack(content["decoder"])))
+    networks = {name: unpack(content[name]) for name in ("actor", "decoder")}
+    return SimpleNamespace(**content | networks)
 
 
 # ---------------------------------------------------------------- plots
 
-# The paper's red, green, blue, cyan, yellow for latents (-1, -0.5, 0, 0.5, 1), in colour-blind safe hues (Okabe-Ito).
+# The paper's red, green, blue, cyan, yellow for latents (-1, -0.5, 0, 0.5, 1), in colour-blind safe hues.
 LATENT_COLOURS = dict(zip((-1, -0.5, 0, 0.5, 1), ("#D55E00", "#009E73", "#0072B2", "#56B4E9", "#F0E442")))
 BLUE, RED, GREY = "#0072B2", "#D55E00", "#888888"
 TRAVERSAL_MAP = "viridis"  # for many values of one latent

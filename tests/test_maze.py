@@ -357,6 +357,8 @@ def test_matched_looks_equally_far_ahead(s4, out):
     for method, ahead in (("wedis_s", [200, 600]), ("wedis", [200, 600])):
         u = unit(s4, out, method, policy=policy, trials=1, samples=[2], look_ahead=[200, 600], rewards=["dense"])
         assert [row["look_ahead"] for row in s4.run(u)[0]] == ahead
+    u.look_ahead = [100, 200, 5000, 9999]  # what comes to the same is planned once, and none looks beyond the end
+    assert [row["look_ahead"] for row in s4.run(u)[0]] == [200, 600]
 
 
 def test_a_maze_of_the_readers_own_is_one_row(s4, stage, out):
