@@ -198,6 +198,8 @@ def run(u):
 
 def main():
     units = units_of(*common.parse_flags(globals()))
+    if THREADS < 1:
+        stop("--threads must be at least 1")
     torch.set_num_threads(THREADS)
     if DRIVE:
         return drive(units[0])
@@ -266,7 +268,8 @@ def drive(u):
     """Sliders in a web page command the Ant in real time. mujoco serves the page, to this machine alone."""
     robots, model, pages, trail = common.Robots(maze_spec(u), 1), maze_spec(u).compile(), [], []
     robots.qpos[0, :2] += u.start
-    names, steps, asked, pool = ["z_" + name for name in u.policy.names], 0, None, skill_pool(u)
+    names, pool = ["z_" + name for name in u.policy.names], skill_pool(u)
+    steps, age, asked = 0, 0, None  # age: of the skill, steps
     hand = SimpleNamespace(mode="stand still", z=dict.fromkeys(names, 0.0), closed=True, text="", geoms=[])
     start = due = time.monotonic()
     try:

@@ -103,6 +103,8 @@ def parse_flags(stage, argv=None):
         where = f"{name} in the row {experiment!r} of EXPERIMENTS"
         stage[name] = convert(value, stage[name], negative[name], where) if name in negative else value
     stage.update(given)
+    if stage["SEED"] < 0:
+        stop("--seed must be 0 or more")
     write_whole(Path(stage["OUT"]) / f".can_write_{os.getpid()}", b"").unlink()  # before any work is lost
     return {name: stage[name] for name in negative}, given
 

@@ -1,4 +1,5 @@
-"""Loads the numbered scripts as modules (their names are no identifiers) and runs them as a user would."""
+"""Loads the numbered scripts as modules (their names are no identifiers) and runs them: cli as a user would, fork without
+the seconds that the imports take, inside in this process. Plus tiny decoders and the flags of a tiny policy training."""
 import importlib.util
 import itertools
 import json
@@ -8,13 +9,17 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
-torch.set_num_threads(2)
+import common
+
+torch.set_num_threads(1)
+S1, S2, S3, S4 = "01_make_dataset", "02_train_wetvae", "03_train_policy", "04_mpc_maze"
 
 
 def script(name):
@@ -24,14 +29,69 @@ def script(name):
     return module
 
 
-for number, name in (("s1", "01_make_dataset"), ("s2", "02_train_wetvae"), ("s3", "03_train_policy"), ("s4", "04_mpc_maze")):
+for number, name in (("s1", S1), ("s2", S2), ("s3", S3), ("s4", S4)):
     globals()[number] = pytest.fixture(lambda name=name: script(name), name=number)
 
 
-def cli(name, *flags, **env):
+# ---------------------------------------------------------------- a tiny policy training
+
+TINY = dict(updates=24, robots=8, skill_steps=5, episode=20, warm_up=80, replay=800, batch=16, hidden=16, reports=2, starts=4,
+            noisy=2, traversal=3, single_run="1 4", multi_run="2 2", threads=1, directions=3)
+
+
+def tiny(out, **changed):
+    """The flags of a tiny training in the folder out."""
+    return [text for name, value in (TINY | changed | dict(out=out)).items() for text in (f"--{name}", str(value))]
+
+
+@pytest.fixture
+def out(tmp_path):
+    """A folder with decoders, untrained: the three that 03 uses, and one of x and y."""
+    three = ["speed", "direction", "curvature"]
+    for name, x_dim, names, circle in (("main", 2, three, None), ("full_circle", 2, three, 1),
+                                       ("speed_acc", 1, ["speed", "acceleration"], None), ("polar", 2, ["x", "y"], None)):
+        torch.manual_seed(0)
+        common.save(tmp_path, "wetvae", name, 0, {}, decoder=common.pack(common.Decoder(len(names), x_dim, 16, circle)),
+                    names=names, ranges={name: (-1.0, 1.0) for name in names}, length=5)
+    return tmp_path
+
+
+@pytest.fixture
+def inside(monkeypatch, capsys):
+    """inside(stage, *flags) runs a stage's main in this process, without pictures: exit code, stdout, stderr."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGPIPE)}
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
+
+    def run(stage, *flags):
+        monkeypatch.setattr(sys, "argv", [stage.__file__, *map(str, flags)])
+        if hasattr(stage, "draw_robots"):
+            monkeypatch.setattr(stage, "draw_robots", lambda: None)
+        monkeypatch.setattr(stage, "save_figure", lambda figure, *_: common.plt.close(figure), raising=False)
+        code, constants = 0, {name: value for name, value in vars(stage).items() if name.isupper()}
+        try:
+            stage.main()
+        except SystemExit as end:
+            code = end.code
+        finally:
+            vars(stage).update(constants)  # the next run begins as from a fresh file
+        printed = capsys.readouterr()
+        return SimpleNamespace(returncode=code, stdout=printed.out, stderr=printed.err)
+    yield run
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def one_line(done, *codes):
+    """Whether a run ended with one line on stderr, and with one of the codes (any but 0)."""
+    return done.returncode in (codes or (1, 2)) and len(done.stderr.strip().splitlines()) == 1
+
+
+# ---------------------------------------------------------------- processes of their own
+
+def cli(name, *flags, cwd=None, **env):
     """Run a script from the command line in a fresh process; returns the completed process with its text."""
     return subprocess.run([sys.executable, str(ROOT / f"{name}.py"), *map(str, flags)], capture_output=True, text=True,
-                          env=os.environ | env, timeout=240)
+                          env=os.environ | env, timeout=240, cwd=cwd)
 
 
 SERVER = """
@@ -58,8 +118,8 @@ for line in sys.stdin:
 
 
 class Fork:
-    """Runs a script like cli, but forked from a fresh Python that has imported torch, mujoco and matplotlib and done nothing else: a
-    process of its own, to be interrupted and killed, without the seconds that the imports take. One at a time."""
+    """Runs a script like cli, but forked from a fresh Python that has imported torch, mujoco and matplotlib and done nothing
+    else: a process of its own, to be interrupted and killed, without the seconds that the imports take. One at a time."""
 
     def __init__(self, folder):
         self.streams, self.code = [folder / "stdout", folder / "stderr"], 0

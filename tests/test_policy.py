@@ -1,325 +1,445 @@
-"""Stage 3: the Ant against Gymnasium's model file, Batch against mj_step, SAC against a plain version."""
+"""Stage 3, WEDIS: robots against Gymnasium and mj_step, networks and SAC against torch.distributions and plain autograd,
+execution and measures by hand, every row of EXPERIMENTS from training to figures. All networks are tiny."""
 import importlib.util
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import common
 import mujoco
 import numpy as np
 import pytest
 import torch
+from conftest import S3, one_line, script, tiny
 from torch import distributions as D
 from torch import nn
 
+CLOSE = dict(atol=1e-5, rtol=1e-4)
+ROWS = list(script(S3).EXPERIMENTS)
 
-def gymnasiums(robot):
+# ---------------------------------------------------------------- robots
+
+FIELDS = """nq nv nu nbody njnt ngeom qpos0 body_parentid body_pos body_mass body_inertia body_ipos jnt_type jnt_axis jnt_pos
+jnt_range jnt_limited jnt_stiffness jnt_margin dof_armature dof_damping geom_type geom_size geom_pos geom_quat geom_friction
+geom_condim geom_contype geom_conaffinity geom_margin geom_solref geom_solimp geom_bodyid actuator_trnid actuator_gear
+actuator_ctrlrange actuator_ctrllimited actuator_gainprm actuator_biasprm""".split()
+
+
+@pytest.mark.parametrize("robot", ["ant", "half_cheetah"])
+def test_robots_are_those_of_gymnasiums_ant_v5_and_halfcheetah_v5(robot, s3):
+    """Gymnasium's model file against ours field by field, and through 20 environment steps."""
     folder = Path(importlib.util.find_spec("gymnasium").origin).parent
-    return mujoco.MjModel.from_xml_path(str(folder / f"envs/mujoco/assets/{robot}.xml"))
-
-
-@pytest.fixture(scope="module")
-def gymnasium_ant():
-    return gymnasiums("ant")
-
-
-# ---------------------------------------------------------------- the robot
-
-FIELDS = """nq nv nu nbody njnt ngeom qpos0 body_parentid body_pos body_quat body_mass body_inertia body_ipos body_iquat
-jnt_type jnt_axis jnt_pos jnt_range jnt_limited jnt_stiffness jnt_solref jnt_solimp jnt_margin dof_armature dof_damping dof_frictionloss
-geom_type geom_size geom_pos geom_quat geom_friction geom_condim geom_contype geom_conaffinity geom_margin geom_gap geom_solref geom_solimp
-geom_bodyid geom_priority actuator_trntype actuator_trnid actuator_gear actuator_ctrlrange actuator_ctrllimited actuator_gaintype
-actuator_gainprm actuator_biastype actuator_biasprm actuator_dyntype actuator_forcelimited""".split()
-
-
-@pytest.mark.parametrize("field", FIELDS)
-def test_ant_is_gymnasiums_field_by_field(field, gymnasium_ant):
-    np.testing.assert_allclose(getattr(common.ant_spec().compile(), field), getattr(gymnasium_ant, field), atol=1e-12)
-
-
-def test_half_cheetah_is_gymnasiums_field_by_field(s3):
-    ours, theirs = s3.half_cheetah_spec().compile(), gymnasiums("half_cheetah")
-    for field in [*FIELDS, "qpos_spring", "body_subtreemass"]:
-        np.testing.assert_allclose(getattr(ours, field), getattr(theirs, field), atol=1e-12, err_msg=field)
-    for field in ("timestep", "integrator", "gravity", "solver", "cone", "iterations", "tolerance", "density", "viscosity", "impratio"):
-        np.testing.assert_array_equal(getattr(ours.opt, field), getattr(theirs.opt, field), field)
-    assert common.Robots(s3.half_cheetah_spec(), 2).observe().shape == (2, 17)  # qpos[1:] and qvel, App. A.1.3
-
-
-def test_ants_physics_options_and_rest_pose_are_gymnasiums(gymnasium_ant):
-    ours = common.ant_spec().compile()
-    for field in ("timestep", "integrator", "gravity", "solver", "cone", "iterations", "tolerance", "density", "viscosity", "impratio"):
-        np.testing.assert_array_equal(getattr(ours.opt, field), getattr(gymnasium_ant.opt, field), field)
-    np.testing.assert_array_equal(common.REST, gymnasium_ant.numeric("init_qpos").data)
-
-
-def test_robots_equal_a_plain_loop_over_gymnasiums_ant(gymnasium_ant):
-    robots, data, rng = common.Robots(common.ant_spec(), 3), mujoco.MjData(gymnasium_ant), np.random.default_rng(0)
+    model = mujoco.MjModel.from_xml_path(str(folder / f"envs/mujoco/assets/{robot}.xml"))
+    spec = common.ant_spec() if robot == "ant" else s3.half_cheetah_spec()
+    ours, data = spec.compile(), mujoco.MjData(model)
+    for field in FIELDS:
+        np.testing.assert_allclose(getattr(ours, field), getattr(model, field), atol=1e-12, err_msg=field)
+    for field in "timestep integrator gravity solver cone iterations tolerance density viscosity impratio".split():
+        np.testing.assert_array_equal(getattr(ours.opt, field), getattr(model.opt, field), field)
+    robots, rng = common.Robots(spec, 3, 1), np.random.default_rng(0)
+    np.testing.assert_array_equal(robots.rest, model.numeric("init_qpos").data if robot == "ant" else model.qpos0)
     robots.reset(np.array([1]), rng)
     data.qpos[:], data.qvel[:] = robots.qpos[1], robots.qvel[1]
-    for _ in range(40):
-        action = rng.uniform(-1, 1, (3, 8)).astype(np.float32)
+    for _ in range(20):
+        action, before = rng.uniform(-1, 1, (3, ours.nu)).astype(np.float32), data.qpos.copy()
         displacement, unstable = robots.step(action)
         data.ctrl[:] = action[1]
-        start = data.qpos[:2].copy()
-        for _ in range(5):
-            mujoco.mj_step(gymnasium_ant, data)
+        mujoco.mj_step(model, data, 5)  # frame_skip
         assert not unstable.any()
-        np.testing.assert_allclose(displacement[1], data.qpos[:2] - start, atol=1e-6)
-    np.testing.assert_allclose(robots.qpos[1], data.qpos, atol=1e-9)
-    np.testing.assert_allclose(robots.observe()[1], np.r_[data.qpos[2:], data.qvel], atol=1e-5)
+        np.testing.assert_allclose(displacement[1], (data.qpos - before)[:robots.places], atol=1e-6)
+    np.testing.assert_allclose(robots.qpos[1], data.qpos, atol=1e-8)
+    np.testing.assert_allclose(robots.observe()[1], np.r_[data.qpos[robots.places:], data.qvel], atol=1e-4, rtol=1e-5)
+    assert robots.age().flatten().tolist() == pytest.approx([20] * 3, abs=1e-3)
 
 
-def test_mirrored_ant_mirrors_its_walk():
-    """The Ant mirrored at the x-axis (legs 1 and 4, 2 and 3 swapped) under mirrored actions moves by the mirrored displacement."""
-    robots, rng = common.Robots(common.ant_spec(), 2), np.random.default_rng(0)
-    order = {1: (2, 3), 2: (4, 5), 3: (6, 7), 4: (0, 1)}  # leg -> (hip, ankle) actuator
-    swap = {1: 4, 2: 3, 3: 2, 4: 1}
-    for _ in range(30):
-        action = rng.uniform(-1, 1, 8)
-        mirrored = np.zeros(8)
-        for leg, (hip, ankle) in order.items():
-            mirrored[order[swap[leg]][0]] = -action[hip]   # hips turn about z: mirrored they turn the other way
-            mirrored[order[swap[leg]][1]] = action[ankle]  # bent legs stay bent: the ranges of 1 and 4, 2 and 3 agree in sign
-        displacement, _ = robots.step(np.stack([action, mirrored]))
-        np.testing.assert_allclose(displacement[1], displacement[0] * torch.tensor([1.0, -1.0]), atol=1e-6)
-    assert abs(displacement).max() > 1e-3
-
-
-def quaternion_product(a, b):
-    return np.r_[a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])]
-
-
-def test_what_the_egocentric_ant_sees_does_not_depend_on_north_or_on_how_its_legs_are_counted():
-    """The same Ant, the world turned by any angle and the torso by k quarter turns with its legs counted on, simulated side by side."""
-    rng, about_z = np.random.default_rng(0), lambda t: np.array([math.cos(t / 2), 0, 0, math.sin(t / 2)])
-    turn = lambda t, v: np.array([[math.cos(t), -math.sin(t)], [math.sin(t), math.cos(t)]]) @ v  # noqa: E731
-    robots, angles, wanted = common.Robots(common.ant_spec(), 4), [0.0, 0.7, -2.0, 2.5], np.array([0.3, 0.2])
+def test_robots_equal_a_plain_loop_over_mj_step():
+    robots, model, rng = common.Robots(common.ant_spec(), 4, 2), common.ant_spec().compile(), np.random.default_rng(0)
     robots.reset(np.arange(4), rng)
-    robots.qpos[0, 3:7] += rng.normal(0, 0.3, 4)
-    robots.qpos[0, 3:7] /= np.linalg.norm(robots.qpos[0, 3:7])
-    knee = np.array([1, -1, -1, 1])  # legs 2 and 3 bend the other way
-    for k in (1, 2, 3):
-        q, v = robots.qpos, robots.qvel
-        q[k, :2], q[k, 2], v[k, :2], v[k, 2], v[k, 5] = turn(angles[k], q[0, :2]), q[0, 2], turn(angles[k], v[0, :2]), v[0, 2], v[0, 5]
-        q[k, 3:7] = quaternion_product(quaternion_product(about_z(angles[k]), q[0, 3:7]), about_z(k * math.pi / 2))
-        v[k, 3:5] = turn(-k * math.pi / 2, v[0, 3:5])
-        for leg in range(4):
-            other = (leg + k) % 4
-            for whole, start in ((q, 7), (v, 6)):
-                hip, ankle = whole[0, start + 2 * other], whole[0, start + 2 * other + 1]
-                whole[k, start + 2 * leg:start + 2 * leg + 2] = hip, ankle * knee[leg] * knee[other]
-    steps = torch.tensor(np.stack([turn(t, wanted) for t in angles]), dtype=torch.float32)
+    data = [mujoco.MjData(model) for _ in range(4)]
+    for one, qpos, qvel in zip(data, robots.qpos, robots.qvel):
+        one.qpos[:], one.qvel[:] = qpos, qvel
     for _ in range(20):
-        state, step, turns = common.egocentric(robots.observe(), steps)
-        torch.testing.assert_close(state, state[:1].expand(4, -1), atol=1e-4, rtol=0)
-        torch.testing.assert_close(step, step[:1].expand(4, -1), atol=1e-5, rtol=0)
-        assert (abs(torch.atan2(step[:, 1], step[:, 0])) <= math.pi / 4 + 1e-5).all()
-        action = torch.rand(1, 8).expand(4, -1) * 2 - 1
-        displacement, _ = robots.step(common.turn_legs(action, -turns, common.ANKLES.roll(1)).numpy())
-        torch.testing.assert_close(displacement, torch.tensor(np.stack([turn(t, displacement[0].numpy()) for t in angles]), dtype=torch.float32),
-                                   atol=1e-4, rtol=0)
-    assert len(set(turns.tolist())) > 1 and displacement.norm(dim=1).min() > 1e-3
+        action = rng.uniform(-1, 1, (4, 8))
+        robots.step(action)
+        for one, a in zip(data, action):
+            one.ctrl[:] = a
+            mujoco.mj_step(model, one, common.FRAME_SKIP)
+    np.testing.assert_allclose(robots.qpos, [one.qpos for one in data], atol=1e-12)
 
 
 def test_an_unstable_simulation_is_noticed_and_the_others_go_on():
-    robots = common.Robots(common.ant_spec(), 3)
+    robots = common.Robots(common.ant_spec(), 3, 1)
     robots.qvel[1] = 1e12
     displacement, unstable = robots.step(np.zeros((3, 8)))
     assert unstable.tolist() == [False, True, False] and torch.isfinite(displacement[[0, 2]]).all()
     robots.reset(np.flatnonzero(unstable))
     assert not robots.step(np.zeros((3, 8)))[1].any()
+    robots.qpos[2, 3:7] = 0, 1, 0, 0  # half a turn about x
+    assert robots.upside_down().tolist() == [False, False, True]
+
+
+# ---------------------------------------------------------------- actor and base frame
+
+def product(a, b):
+    """Of two quaternions."""
+    return np.r_[a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])]
+
+
+@pytest.mark.parametrize("yaw", [0.7, -2.0, math.pi, 6.0])
+def test_turning_the_world_changes_neither_inputs_nor_actions(yaw):
+    """A world and the same one turned, simulated side by side for ten steps of the policy."""
+    torch.manual_seed(0)
+    robots, rng = common.Robots(common.ant_spec(), 2, 1), np.random.default_rng(0)
+    robots.reset(np.arange(2), rng)
+    turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+    q, v = robots.qpos, robots.qvel
+    q[0, 3:7] = (0.7, 0.3, -0.2, 0.6) / np.linalg.norm((0.7, 0.3, -0.2, 0.6))
+    q[1], v[1] = q[0], v[0]
+    q[1, :2], v[1, :2] = turn @ q[0, :2], turn @ v[0, :2]
+    q[1, 3:7] = -product(np.array([math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)]), q[0, 3:7])  # -q is the same turn as q
+    command = np.array([0.3, 0.5])
+    c = torch.tensor(np.stack([command, turn @ command]), dtype=torch.float32)
+    actor = common.Actor(27, 2, 8, 16, True)
+    for _ in range(10):
+        x, action = actor.inputs(robots.observe(), c), actor.act(robots.observe(), c, True)
+        torch.testing.assert_close(x[0], x[1], atol=1e-3, rtol=0)
+        torch.testing.assert_close(action[0], action[1], atol=1e-3, rtol=0)
+        displacement, _ = robots.step(action[:1].expand(2, -1).numpy())
+        np.testing.assert_allclose(displacement[1], turn @ displacement[0].numpy(), atol=1e-4)
+    assert (actor.act(robots.observe(), c[[0, 0]], True).diff(dim=0).abs() > 1e-4).any()  # the command does count
+
+
+def test_log_probability_is_that_of_a_transformed_distribution():
+    torch.manual_seed(0)
+    actor = common.Actor(5, 2, 3, 32, False)
+    x = actor.inputs(torch.randn(200, 5), torch.randn(200, 2))
+    action, log_prob = actor(x)
+    mean, log_std = actor.net(x).chunk(2, 1)
+    oracle = D.TransformedDistribution(D.Normal(mean, log_std.clamp(-5, 2).exp()), D.TanhTransform(cache_size=1))
+    inside = (action.abs() < 0.999).all(1)  # where tanh can be inverted in float32
+    assert inside.sum() > 100
+    torch.testing.assert_close(log_prob[inside], oracle.log_prob(action).sum(1)[inside], atol=2e-3, rtol=1e-3)
+    torch.testing.assert_close(actor(x, deterministic=True)[0], torch.tanh(mean))
 
 
 # ---------------------------------------------------------------- reward and SAC
 
-def test_reward_is_the_scaled_log_likelihood_up_to_its_maximum(s3):
+def test_reward_is_equation_6_up_to_its_maximum(s3):
     torch.manual_seed(0)
-    decoder, z, displacement = common.Decoder(3), torch.randn(40, 2), 0.1 * torch.randn(40, 2)
-    mean, log_var = decoder(torch.cat([z, torch.zeros(40, 1)], 1), 1)
-    for floor in (0.0, 10.0):  # without a floor: App. A.1.3; far above every deviation: the floor alone
-        std = (log_var[:, 0].exp() / 20).sqrt() if floor == 0 else torch.tensor(floor)
-        p = D.Independent(D.Normal(mean[:, 0] / 10, std.expand(40, 2)), 1)
-        ours = s3.reward(*common.first_step(decoder, z), displacement, floor)
-        torch.testing.assert_close(ours, 0.1 * (p.log_prob(displacement) - p.log_prob(mean[:, 0] / 10)))
+    mean, log_var, displacement = torch.randn(40, 2), torch.randn(40, 2), 0.1 * torch.randn(40, 2)
+    for floor, std in ((0.0, (log_var.exp() / 20).sqrt()), (10.0, torch.full((40, 2), 10.0))):  # App. A.1.3, then the floor alone
+        p = D.Independent(D.Normal(mean / 10, std), 1)
+        expected = s3.REWARD_SCALE * (p.log_prob(displacement) - p.log_prob(mean / 10))
+        torch.testing.assert_close(s3.reward(mean, log_var, displacement, floor), expected, **CLOSE)
 
 
-def test_sac_gradients_equal_a_plain_version(s3):
-    """Against two separate critics, frozen parameters and three separate backward passes, term by term from the paper of SAC."""
+def small_sac(s3, every):
     torch.manual_seed(0)
-    s3.HIDDEN, s3.TEMPERATURE = 32, 0.05
-    actor, critics = common.Actor(5, 2, 3, 32), s3.Critics(10)
-    value, target = s3.value_network(7), s3.value_network(7)
-    x, a, x2, r = torch.randn(64, 7), torch.rand(64, 3) * 2 - 1, torch.randn(64, 7), torch.randn(64)
-    torch.manual_seed(1)
-    sum(s3.sac_losses(actor, critics, value, target.requires_grad_(False), x, a, x2, r)).backward()
-    ours = [p.grad.clone() for p in [*actor.net.parameters(), *value.parameters(), *critics.parameters()]]
-    for p in [*actor.parameters(), *value.parameters(), *critics.parameters()]:
-        p.grad = None
+    s3.HIDDEN, s3.TEMPERATURE, s3.BASE_FRAME, s3.ACTOR_EVERY = 32, 0.05, False, every
+    sac = s3.Sac(5, 2, 3)
+    for one in (sac.target, sac.average):
+        for p in one.parameters():
+            p.add_(0.1 * torch.randn_like(p))  # unlike the networks that they follow
+    batch = torch.randn(64, 7), torch.rand(64, 3) * 2 - 1, torch.randn(64, 7), torch.randn(64)
+    return sac, batch
 
+
+def test_one_update_of_sac_equals_a_plain_version(s3):
+    """Adam is replaced by a plain step down the gradient; the plain version has two separate critics."""
+    sac, (x, a, x2, r) = small_sac(s3, 1)
+    sac.critic_adam = torch.optim.SGD(sac.critics.parameters(), lr=1.0)
+    sac.actor_adam = torch.optim.SGD([*sac.actor.parameters(), *sac.value.parameters()], lr=1.0)
     plain = [nn.Sequential(nn.Linear(10, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, 1)) for _ in range(2)]
     for k, net in enumerate(plain):
         for i, layer in enumerate((net[0], net[2], net[4])):
-            layer.weight.data, layer.bias.data = critics.weights[i][k].T.detach().clone(), critics.biases[i][k, 0].detach().clone()
-    q = lambda net, action: net(torch.cat([x, action], 1)).squeeze(1)  # noqa: E731
-    torch.testing.assert_close(critics(x, a), torch.stack([q(net, a) for net in plain]))
-    backup = r + s3.DISCOUNT * target(x2).squeeze(1)
-    sum(0.5 * nn.functional.mse_loss(q(net, a), backup) for net in plain).backward()
-    critic_grads = [torch.stack([net[i].weight.grad.T for net in plain]) for i in (0, 2, 4)]
-    critic_grads += [torch.stack([net[i].bias.grad[None] for net in plain]) for i in (0, 2, 4)]
+            layer.weight.data = sac.critics.weights[i][k].T.detach().clone()
+            layer.bias.data = sac.critics.biases[i][k, 0].detach().clone()
+    actor, value = s3.copy.deepcopy(sac.actor), s3.copy.deepcopy(sac.value)
+    target, average = s3.copy.deepcopy(sac.target), s3.copy.deepcopy(sac.average)
+    torch.manual_seed(1)
+    sac.update(x, a, x2, r, 0.9)
+
+    def q(net, action):
+        return net(torch.cat([x, action], 1)).squeeze(1)
+
+    def descend(loss, *networks):
+        parameters = [p for net in networks for p in net.parameters()]
+        for p, slope in zip(parameters, torch.autograd.grad(loss, parameters)):
+            p.data -= slope
+
+    torch.testing.assert_close(s3.Critics(10)(x, a).shape, torch.Size([2, 64]))
+    goal = (r + 0.9 * target(x2).squeeze(1)).detach()
+    descend(sum(0.5 * (q(net, a) - goal).square().mean() for net in plain), *plain)
+    torch.testing.assert_close(sac.critics(x, a), torch.stack([q(net, a) for net in plain]), **CLOSE)
     torch.manual_seed(1)
     a_new, log_prob = actor(x)
     smaller = torch.min(q(plain[0], a_new), q(plain[1], a_new))
-    (0.05 * log_prob - smaller).mean().backward()
-    (0.5 * nn.functional.mse_loss(value(x).squeeze(1), (smaller - 0.05 * log_prob).detach())).backward()
-    expected = [p.grad for p in [*actor.net.parameters(), *value.parameters()]] + critic_grads
-    for found, wanted in zip(ours, expected):
-        torch.testing.assert_close(found, wanted, atol=1e-6, rtol=1e-4)
+    v_goal = (smaller - 0.05 * log_prob).detach()
+    descend((0.05 * log_prob - smaller).mean(), actor)
+    descend(0.5 * (value(x).squeeze(1) - v_goal).square().mean(), value)
+    for ours, theirs, old, rate in ((sac.actor, actor, average, s3.AVERAGED), (sac.value, value, target, s3.SMOOTHING)):
+        followed = sac.average if ours is sac.actor else sac.target
+        for p, wanted, before, after in zip(*(net.parameters() for net in (ours, theirs, old, followed))):
+            torch.testing.assert_close(p, wanted, **CLOSE)
+            torch.testing.assert_close(after, (1 - rate) * before + rate * wanted, **CLOSE)
 
 
-# ---------------------------------------------------------------- measures and the relation function
+def test_the_actor_waits_for_every_second_update_of_the_critics(s3):
+    sac, (x, a, x2, r) = small_sac(s3, 2)
+    waiting = [sac.actor, sac.value, sac.target, sac.average]
 
-def test_tracking_numbers_by_hand(s3):
-    angle, speed = np.tile(np.radians([-60, -30, 0, 30, 60]), 5), np.repeat([1.0, 2, 3, 4, 5], 5)
-    predicted = speed[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
-    turned = angle + np.radians(10)
-    executed = 0.9 * speed[:, None] * np.stack([np.cos(turned), np.sin(turned)], 1)
-    error, degrees, ratio = s3.tracking(executed, predicted)
-    assert error == pytest.approx(np.sqrt(1 + 0.81 - 1.8 * np.cos(np.radians(10))))
-    np.testing.assert_allclose(degrees, 10)
-    np.testing.assert_allclose(ratio, 0.9 * np.cos(np.radians(10)))
-
-
-def test_relation_is_recovered_from_a_decoder_that_has_one(s3, monkeypatch):
-    """A stand-in decoder whose heading is 0.6 z_dir and turns by 0.21 z_cur a step: the weight is 0.35."""
-    def decode(z, steps):
-        heading = 0.6 * z[:, 1, None] + 0.21 * z[:, 2, None] * torch.arange(steps)
-        mean = torch.stack([heading.cos(), heading.sin()], 2)
-        return mean, mean
-    decode.axes = torch.eye(3)
-    weight, miss = s3.calibrate_relation(decode)
-    assert weight == pytest.approx(0.35, abs=1e-3) and miss(weight) < 1e-3 < miss(0.2)
+    def changed(networks):
+        before = [p.clone() for net in networks for p in net.parameters()]
+        sac.update(x, a, x2, r, 0.9)
+        return [not torch.equal(p, q) for p, q in zip(before, [p for net in networks for p in net.parameters()])]
+    assert all(changed([sac.critics])) and sac.updates == 1
+    assert all(changed(waiting)) and not any(changed(waiting))
 
 
-def test_relation_of_the_half_cheetah_is_recovered_likewise(s3, monkeypatch):
-    """Speed 0.5 z_speed, faster by 0.06 z_acc a step whichever way it runs: the weight is 0.12."""
-    def decode(z, steps):
-        mean = (0.5 * z[:, :1] + 0.06 * z[:, :1].sign() * z[:, 1:] * torch.arange(steps))[..., None]
-        return mean, mean
-    decode.axes = torch.eye(2)
-    monkeypatch.setattr(s3, "ROBOT", "half_cheetah")
-    monkeypatch.setattr(s3, "EXPERIMENT", "half_cheetah")
-    weight, _ = s3.calibrate_relation(decode)
-    assert abs(weight - 0.12) < 0.01  # not exact: where braking turns the direction round, sign(z) flips and the free run does not
+def test_horizon_grows_and_learning_rate_falls(s3):
+    sac, _ = small_sac(s3, 1)
+    for progress, horizon, rate in ((0, 20, 1), (0.25, (20 + 1 / 0.015) / 2, 1), (0.5, 1 / 0.015, 1), (0.75, 1 / 0.015, 0.5)):
+        assert 1 / (1 - sac.schedule(progress)) == pytest.approx(horizon)
+        assert sac.critic_adam.param_groups[0]["lr"] == pytest.approx(rate * s3.LEARNING_RATE)
 
 
-def test_a_policy_that_is_taken_over_walks_the_steps_of_the_other_decoder(s3, monkeypatch, tmp_path):
-    """Told z of the full circle it does what it does when given that decoder's step; and one that is not egocentric is refused."""
+# ---------------------------------------------------------------- replay buffer and checkpoints
+
+@pytest.fixture
+def run(s3):
+    """A Run of 8 robots with a replay buffer of 16 steps each; its stored z counts the steps from 1."""
     torch.manual_seed(0)
-    monkeypatch.setattr(s3, "TAKEN", "ant_semi")
-    decoder = common.load_decoder(common.load(tmp_path, "wetvae", "full_circle", 0))
-    taken, own = common.load_actor(s3.take(decoder)), common.load_actor(common.load(tmp_path, "policy", "ant_semi", 0))
-    robots, z = common.Robots(common.ant_spec(), 20), torch.randn(20, 2)
-    robots.reset(np.arange(20), np.random.default_rng(0))
-    s = robots.observe()
-    x, turns = own.inputs(s, z, common.predict(decoder, nn.functional.pad(z, (0, 1)), 1)[:, 0])
-    assert len(own.told) and torch.equal(taken.told, own.told)  # calibrated by steps, so it holds for any decoder's
-    taken.told = torch.zeros(0, 0, 2)
-    torch.testing.assert_close(taken.act(s, z, True), own.seen(own(x, True)[0], -turns))
-    content = common.load(tmp_path, "policy", "ant_semi", 0)
-    del content["actor"]["decoder.axes"]
-    monkeypatch.setattr(s3, "load", lambda *_: content)
-    with pytest.raises(SystemExit):
-        s3.take(decoder)
+    vars(s3).update(ROBOTS=8, SKILL_STEPS=4, EPISODE=12, REPLAY=128, WARM_UP=16, HIDDEN=16, THREADS=1, UPDATES=10 ** 9)
+    run = s3.Run(2, 2, None, [], {})
+
+    def steps(n):
+        for _ in range(n):
+            run.z = torch.full((8, 2), run.steps + 1.0)
+            run.act(torch.zeros(8, 2))
+            run.collect()
+    run.go = steps
+    return run
 
 
-def test_steps_of_a_policy_that_misses_are_calibrated(s3, monkeypatch):
-    """Robots without physics, whose torso turns, walk at 0.6 to 0.9 of what they are told and up to 20 degrees aside, by how it lies
-    to their torso (the same each quarter turn): they must be told what undoes it, whichever way they face."""
-    class World:
-        def __init__(self, n):
-            self.heading = np.zeros(n)
-
-        def reset(self, ids, rng):
-            self.heading[ids] = rng.uniform(-7, 7, len(ids))
-
-        def observe(self):
-            s = torch.zeros(len(self.heading), 27)
-            s[:, 1], s[:, 4] = torch.from_numpy(np.cos(self.heading / 2)), torch.from_numpy(np.sin(self.heading / 2))
-            return s
-
-        def step(self, told):
-            told = told @ np.array([1, 1j])
-            seen = 4 * (np.angle(told) - self.heading)
-            walked = s3.STEP_SCALE * told * (0.75 + 0.15 * np.cos(seen)) * np.exp(0.3j * np.sin(seen))
-            self.heading += 0.05
-            return torch.from_numpy(np.stack([walked.real, walked.imag], 1)).float(), np.zeros(len(told), bool)
-
-    actor = common.Actor(26, 2, 8, 8, common.Decoder(3))
-    for name, value in dict(make_robots=World, CALIBRATED=6, CALIBRATORS=1000, EPISODE=40).items():
-        monkeypatch.setattr(s3, name, value)
-    monkeypatch.setattr(actor, "follow", lambda s, step, deterministic: actor.tell(s, step))  # no network: a robot does what it is told
-    actor.told = s3.calibrate_steps(actor)
-    world, angle = World(200), torch.linspace(-3, 3, 200)
-    world.reset(np.arange(200), np.random.default_rng(0))
-    for speed in (0.1, 0.3, 0.5):  # 0.6 times the fastest that is told is 0.51
-        step = speed * torch.stack([angle.cos(), angle.sin()], 1)
-        untold, told = (world.step(x.numpy())[0] / s3.STEP_SCALE - step for x in (step, actor.tell(world.observe(), step)))
-        assert told.norm(dim=1).mean() < 0.1 * speed and untold.norm(dim=1).mean() > 0.28 * speed
-    assert actor.tell(world.observe(), 5 * step).norm(dim=1).max() < common.FASTEST + 1e-6
+@pytest.mark.parametrize("n", [3, 16, 37])
+def test_sample_gives_stored_steps_of_the_recent_window(run, n):
+    run.go(n)
+    for recent, oldest in ((None, max(1, n - 15)), (16, max(1, n - 1))):
+        s, a, s2, displacement, z = run.sample(2000, recent)
+        assert set(z[:, 0].int().tolist()) == set(range(oldest, n + 1))
+        assert (s.shape, a.shape, s2.shape, displacement.shape) == ((2000, 27), (2000, 8), (2000, 27), (2000, 2))
+        torch.testing.assert_close(displacement / 0.05, s2[:, 13:15], atol=2.0, rtol=0)  # metres in 0.05 s
+    rows = run.replay.view(-1, 8, 66)
+    s, s2, when = rows[..., :27], rows[..., 35:62], rows[..., -1]
+    goes_on = (when[1:] == when[:-1] + 1) & (s[1:] == s2[:-1]).all(2)  # a step begins where the last one of the robot ended
+    assert goes_on.float().mean() > (0.5 if n > 15 else 0)
 
 
-def test_what_is_told_lies_between_the_entries_of_the_table():
-    """A step on an entry gets that entry, one between two their mean; a quarter turn of the torso or any turn of the world change nothing."""
+def test_an_unstable_step_is_not_stored_and_the_robot_starts_anew(run):
+    run.go(3)
+    step = run.robots.step
+
+    def fail(action):
+        displacement, unstable = step(action)
+        displacement[5], unstable[5] = math.nan, True
+        return displacement, unstable
+    run.robots.step = fail
+    run.go(1)
+    last, before = run.replay[24:32], run.replay[16:24]
+    assert torch.equal(last[5], before[5]) and not torch.equal(last[4], before[4]) and run.unstable == 1
+    assert run.robots.age()[5] == 0 and (np.delete(run.robots.age().numpy(), 5) > 0).any()
+    assert torch.isfinite(run.replay).all()
+
+
+def outcome(out, experiment):
+    """Policy and checkpoint without clocks and flags."""
+    found = [common.load(out, kind, experiment, 0) for kind in ("policy", "policy-checkpoint")]
+    found[1]["numbers"] = found[1]["numbers"][:3]  # the last is the clock
+    return [{key: value for key, value in content.items() if key not in ("seconds", "config", "sha256")} for content in found]
+
+
+def same(one, other):
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[k], other[k]) for k in one if k not in ("minutes", "seconds"))
+    if isinstance(one, (list, tuple)):
+        return len(one) == len(other) and all(map(same, one, other))
+    return torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other
+
+
+@pytest.mark.parametrize("experiment", ["ant_semi", "ant_dads", "ant_sectar", "half_cheetah"])
+def test_resumed_and_two_threads_give_the_same_bits(experiment, out, inside, monkeypatch, s3):
+    monkeypatch.setattr(s3, "measure", lambda *_: None)
+    monkeypatch.setattr(s3, "draw_skills", lambda *_: None)
+    flags = ["--experiment", experiment, "--updates", 48]
+    collect, ends = s3.Run.collect, []
+
+    def cut(run):
+        collect(run)
+        if len(ends) == 0 and run.sac.updates == 24:
+            run.checkpoint()
+            raise SystemExit("cut")
+    for threads in (1, 2, 1):
+        if len(ends) < 2:
+            assert inside(s3, *tiny(out, threads=threads), *flags).returncode == 0
+            ends.append(outcome(out, experiment))
+    (out / f"policy_{experiment}_seed0.pt").unlink()
+    whole, ends[:] = list(ends), []
+    monkeypatch.setattr(s3.Run, "collect", cut)
+    assert inside(s3, *tiny(out), *flags).returncode == "cut"
+    monkeypatch.setattr(s3.Run, "collect", collect)
+    assert inside(s3, *tiny(out), *flags, "--resume", "true").returncode == 0
+    assert same(whole[0], whole[1]) and same(whole[0], outcome(out, experiment))
+
+
+# ---------------------------------------------------------------- relation functions and execution
+
+def test_relation_functions_are_the_papers():
+    z = torch.tensor([[0.5, 0.2, 1.0], [-0.5, 0.0, 1.0]])
+    found = common.next_skill(z, ["speed", "direction", "curvature"], dict(curvature=-0.2))  # Sec. 6.1.2
+    torch.testing.assert_close(found, torch.tensor([[0.5, 0.0, 1.0], [-0.5, -0.2, 1.0]]))
+    found = common.next_skill(z[:, [0, 2]], ["speed", "acceleration"], dict(acceleration=-0.1))  # A.3.2
+    torch.testing.assert_close(found, torch.tensor([[0.4, 1.0], [-0.4, 1.0]]))
+    found = common.next_skill(z, ["speed", "direction", "acceleration"], dict(acceleration=0.1))  # Sec. 4.2.2
+    torch.testing.assert_close(found, torch.tensor([[0.6, 0.2, 1.0], [-0.4, 0.0, 1.0]]))
+
+
+class Turning(nn.Module):
+    """A decoder whose skills turn by exactly `weight` of z_curvature a transition."""
+    x_dim, axes, circle = 2, torch.eye(3), None
+
+    def __init__(self, weight):
+        super().__init__()
+        self.weight = weight
+
+    def forward(self, z, steps):
+        angle = z[:, 1:2] + self.weight * z[:, 2:3] * torch.arange(steps)
+        return (0.5 + 0.2 * z[:, :1, None]) * torch.stack([angle.cos(), angle.sin()], 2), torch.zeros(len(z), steps, 2)
+
+
+@pytest.mark.parametrize("weight", [0.155, -0.31])
+def test_calibration_finds_the_weight_of_a_decoder_that_turns_exactly(s3, weight):
+    assert s3.calibrate_relation(Turning(weight), ["speed", "direction", "curvature"], 5) == dict(curvature=pytest.approx(weight))
+
+
+def test_commands_are_the_decoders_first_steps():
     torch.manual_seed(0)
-    actor = common.Actor(26, 2, 8, 8, common.Decoder(3))
-    actor.told = 0.1 * torch.randn(5, 6, 2)
-
-    def added(speed, angle, heading):
-        s = torch.zeros(1, 27)
-        s[0, 1], s[0, 4] = math.cos(heading / 2), math.sin(heading / 2)
-        step = torch.polar(torch.tensor([speed]), torch.tensor([angle + heading]))
-        told = actor.tell(s, torch.view_as_real(step))
-        return torch.view_as_real(torch.view_as_complex(told) * step.conj() / step.abs() - step.abs())[0]
-
-    row, column = common.FASTEST / 4, math.pi / 2 / 6
-    for k in (0, 1, 7):
-        for heading in (0.0, 1.0, -2.5):
-            near = dict(atol=1e-4, rtol=0)
-            torch.testing.assert_close(added(2 * row, 3.0001 * column + k * math.pi / 2, heading), actor.told[2, 3], **near)
-            torch.testing.assert_close(added(2.5 * row, 4.0001 * column + k * math.pi / 2, heading), actor.told[2:4, 4].mean(0), **near)
-            torch.testing.assert_close(added(row, 5.5 * column + k * math.pi / 2, heading), actor.told[1, [5, 0]].mean(0), **near)
+    decoder, z = common.Decoder(3, 2, 16), torch.randn(6, 3)
+    policy = SimpleNamespace(decoder=decoder, names=["speed", "direction", "curvature"], relation=dict(curvature=0.3))
+    found = common.commands_of(policy, z, 4)
+    for t in range(4):
+        single = torch.stack([z[:, 0], z[:, 1] + t * 0.3 * z[:, 2], torch.zeros(6)], 1)
+        torch.testing.assert_close(found[:, t], decoder(single, 1)[0][:, 0])
+    policy.names = []  # SeCTAR
+    torch.testing.assert_close(common.commands_of(policy, z, 4), decoder(z, 4)[0])
+    policy.decoder = common.SkillDynamics(3)
+    torch.testing.assert_close(common.commands_of(policy, z, 4), z[:, None].expand(-1, 4, -1))
 
 
-# ---------------------------------------------------------------- the command line
+class Fake:
+    """Robots that make `share` of the step that they are asked for, and keep what that was."""
+    places = 2
 
-def test_three_stages_from_the_command_line(fork, tmp_path):
-    """01 -> 02 -> 03 in a new folder; 03 prints and writes what the README says it does."""
-    assert fork("01_make_dataset", "--out", tmp_path, "--trajectories", 3000).returncode == 0
-    done = fork("02_train_wetvae", "--out", tmp_path, "--batch", 500, "--held_out", 500, "--epochs", 2, "--baseline_epochs", 2)
-    assert done.returncode == 0 and done.stdout.count("purity") == 2 * 4, done.stdout + done.stderr  # two headings, two times three axes
-    assert len(common.read_csv(tmp_path / "results/wetvae.csv")) == 6 and len(common.read_csv(tmp_path / "results/crosstalk.csv")) == 18
-    done = fork("03_train_policy", "--out", tmp_path, "--updates", 80, "--reports", 2, "--warm_up", 1000, "--replay", 5000,
-               "--hidden", 32, "--coverage", 5, "--traversal", 3, "--starts", 1, "--calibrated", 1)
-    assert done.returncode == 0 and "calibrated: z_direction " in done.stdout and f"using {tmp_path}" in done.stdout, done.stderr
-    row, = common.read_csv(tmp_path / "results/policies.csv")
-    assert row["experiment"] == "ant_semi" and int(row["updates"]) == 80 and float(row["tracking_error"]) > 0
-    curve = common.read_csv(tmp_path / "results/learning_curve_ant_semi_seed0.csv")
-    assert int(curve[-1]["updates"]) == 80
-    assert f"{float(curve[-1]['tracking_error']):.3f}" == f"{float(row['tracking_error_as_trained']):.3f}"
-    for name in ("fig04_latent_traversals", "fig05_skills_wedis", "learning_curve_ant_semi", "fig09_dataset"):
-        assert (tmp_path / f"figures/{name}.png").stat().st_size > 10_000
+    def __init__(self, n=1, share=0.9, age=1000.0):
+        self.at, self.share, self.steps, self.asked = torch.zeros(n, 2), share, age, []
+
+    def place(self):
+        return self.at.clone()
+
+    def age(self):
+        return torch.full((len(self.at), 1), self.steps)
+
+    def observe(self):
+        return torch.zeros(len(self.at), 3)
+
+    def upside_down(self):
+        return np.arange(len(self.at)) == 0
+
+    def reset(self, ids, rng=None):
+        self.at[ids] = 0
+
+    def step(self, action):
+        self.asked.append(torch.from_numpy(action))
+        self.at, self.steps = self.at + 0.1 * self.share * self.asked[-1], self.steps + 1
+        return 0.1 * self.share * self.asked[-1], np.zeros(len(self.at), bool)
 
 
-def test_half_cheetah_and_full_circle_from_the_command_line(fork, tmp_path):
-    for experiment, data, decoder in (("half_cheetah", "speed_acc", "speed_acc"), ("ant_full", "full", "full")):
-        assert fork("01_make_dataset", "--out", tmp_path, "--experiment", data, "--trajectories", 2000).returncode == 0
-        done = fork("02_train_wetvae", "--out", tmp_path, "--experiment", decoder, "--batch", 500, "--held_out", 500, "--epochs", 1,
-                    "--baseline_epochs", 1)
-        assert done.returncode == 0, done.stderr
-        done = fork("03_train_policy", "--out", tmp_path, "--experiment", experiment, "--taken", "", "--updates", 8, "--reports", 1, "--warm_up", 640,
-                   "--replay", 2000, "--hidden", 32, "--coverage", 5, "--traversal", 3, "--starts", 1, "--calibrated", 1)
-        assert done.returncode == 0 and "tracking error" in done.stdout, done.stderr
-    rows = common.read_csv(tmp_path / "results/policies.csv")
-    assert {r["experiment"]: r["robot"] for r in rows} == dict(half_cheetah="half_cheetah", ant_full="ant")
-    gaps = {r["labels"]: r["largest_gap_deg"] for r in common.read_csv(tmp_path / "results/wetvae.csv") if r["factor"] == "direction"}
-    assert gaps.keys() == {"full", "circle"} and all(gaps.values())
+OBEY = SimpleNamespace(act=lambda s, c, deterministic: c.clone())  # an actor whose action is its command
+
+
+@pytest.mark.parametrize("c, reference, age, expected", [
+    ((0.3, 0.0), (0.1, 0.0), 1000, (0.4, 0.0)),        # FEEDBACK 0.1 of one trajectory unit
+    ((0.3, 0.0), (0.0, 5.0), 1000, (0.3, 0.2)),        # CORRECTION: at most 0.2
+    ((3.0, 4.0), (0.0, 0.0), 1000, (0.51, 0.68)),      # FASTEST: 0.85 long
+    ((3.0, 4.0), (0.0, 0.0), 0, (0.12, 0.16)),         # soft start: 0.2 long
+    ((3.0, 4.0), (0.0, 0.0), 20, (0.315, 0.42)),       # half of it: 0.525 long
+    ((0.1, 0.0), (0.0, 0.0), 0, (0.1, 0.0))])          # shorter ones pass
+def test_closed_loop_by_hand(c, reference, age, expected):
+    found = common.closed_loop(torch.tensor([c]), torch.tensor([reference]), Fake(age=float(age)), 0.1)
+    torch.testing.assert_close(found, torch.tensor([expected]))
+
+
+def test_execute_holds_commands_open_and_closed():
+    commands = torch.tensor([[[0.5, 0.0], [0.0, 2.0]]])
+    policy, robots = SimpleNamespace(actor=OBEY, scale=0.1), Fake()
+    assert len(list(common.execute(policy, robots, commands, 3, False, True))) == 6
+    torch.testing.assert_close(torch.cat(robots.asked), commands[0].repeat_interleave(3, 0))  # open loop: unchanged
+    still = Fake(share=0.0)
+    list(common.execute(policy, still, commands[:, :1], 3, True, True))
+    torch.testing.assert_close(torch.cat(still.asked)[:, 0], torch.tensor([0.5, 0.55, 0.6]))  # it falls behind by 0.5 a step
+
+
+# ---------------------------------------------------------------- measures
+
+def test_tracking_and_following_by_hand(s3, monkeypatch):
+    """Robots that make 9/10 of each step end a tenth short; of three skills one after another, each anew."""
+    monkeypatch.setattr(s3, "make_robots", lambda n, threads: Fake(n))
+    vars(s3).update(STARTS=10, SINGLE_RUN=(1, 7), MULTI_RUN=(3, 4))
+    names = ["speed", "direction", "curvature"]
+    policy = s3.as_policy(OBEY, Turning(0.2), names, dict(curvature=0.2))
+    assert s3.tracking(policy, False) == pytest.approx(0.1, abs=1e-5) and s3.tracking(policy, True) < 0.1
+    middle, most, fell = s3.following(s3.as_policy(OBEY, Turning(0.0), names, dict(curvature=0.0)), False)
+    # 12 steps of 0.1 x (0.5 + 0.2 z_speed), z_speed ~ U(0, 1.5); a tenth of them is missing
+    assert 0.1 * 1.2 * 0.5 < middle < most < 0.1 * 1.2 * 0.8 and fell == pytest.approx(0.1)
+    C = s3.executed_cross_talk(policy, dict(speed=(0.0, 1.0), direction=(-1.5, 1.5)), False)
+    assert C[0] == pytest.approx([0.9 * 0.6, 0], abs=1e-4) and C[1] == pytest.approx([0, 1], abs=1e-4)
+
+
+# ---------------------------------------------------------------- from training to figures
+
+@pytest.mark.parametrize("experiment", ROWS)
+def test_each_row_of_experiments_from_training_to_figures(experiment, s3, fork, out):
+    done = fork(S3, *tiny(out), "--experiment", experiment)
+    assert done.returncode == 0, done.stderr
+    row, = common.read_csv(out / "results/policies.csv")
+    assert row["experiment"] == experiment and int(row["updates"]) == 24 and float(row["tracking_error"]) > 0
+    curve = common.read_csv(out / f"results/learning_curve_{experiment}_seed0.csv")
+    assert float(curve[-1]["tracking_error"]) == pytest.approx(float(row["tracking_error"]), rel=1e-4)
+    wedis = row["method"] == "wedis"
+    assert bool(row["tracking_error_closed"]) == bool(row["fall_rate"]) == wedis and bool(row["metric"]) != wedis
+    for name in (s3.EXPERIMENTS[experiment].get("FIGURE", f"skills_{experiment}"), f"learning_curve_{experiment}", "fig14_robots"):
+        assert (out / f"figures/{name}.png").stat().st_size > 5_000
+
+
+def test_a_row_of_ones_own_and_measuring_flags(s3, inside, out):
+    """A new row trains and is measured; flags that only measure are no obstacle to --resume, others are one line."""
+    s3.EXPERIMENTS["mine"] = dict(TEMPERATURE=0.01, ROBOTS=4)
+    flags = [text for text in tiny(out, experiment="mine") if text not in ("--robots", "8")]
+    assert inside(s3, *flags).returncode == 0
+    policy = common.load_policy(out, "mine", 0)
+    assert policy.config["TEMPERATURE"] == 0.01 and policy.config["ROBOTS"] == 4
+    more = ["--resume", "true", "--starts", 2, "--directions", 4, "--traversal", 5, "--z_range", 1, "--noisy", 1, "--figure", "x"]
+    for extra in (more, [*more, "--train", "false"]):
+        assert inside(s3, *flags, *extra).returncode == 0
+    done = inside(s3, *flags, "--resume", "true", "--hidden", 24)
+    assert one_line(done, 2) and "HIDDEN = 16, not 24" in done.stderr
+    done = inside(s3, *flags, "--train", "false", "--step_scale", 0.2)
+    assert one_line(done, 2) and "--step_scale" in done.stderr
+
+
+def test_a_policy_is_saved_before_it_is_measured(s3, inside, out, monkeypatch):
+    def fail(*_):
+        raise ZeroDivisionError
+    monkeypatch.setattr(s3, "measure", fail)
+    with pytest.raises(ZeroDivisionError):
+        inside(s3, *tiny(out))
+    assert common.load_policy(out, "ant_semi", 0).updates == 24

@@ -1,230 +1,148 @@
-"""Kill it, damage what it wrote, feed it rubbish: nothing is lost and one line says why."""
-import os
-import runpy
-import shutil
+"""What happens to people: Ctrl-C, kill -9, a full disk, a notebook's environment, settings that make no sense, and every
+constant of stage 3 changed. An error is one line, and nothing that was saved is lost."""
 import signal
 import subprocess
 import sys
-import time
 
 import common
-import numpy as np
 import pytest
-import torch
-from conftest import ROOT, Fork, cli
+from conftest import ROOT, S1, S3, S4, TINY, cli, one_line, script, tiny
+from test_policy import outcome, same
 
-S1, S2, S3, S4 = "01_make_dataset", "02_train_wetvae", "03_train_policy", "04_mpc_maze"
-TINY_DATA = ["--trajectories", 1500]
-TINY_VAE = ["--batch", 200, "--held_out", 500, "--epochs", 36, "--checkpoint", 0, "--baseline", "false", "--hidden", 32, "--threads", 1]
-TINY_POLICY = ["--updates", 128, "--reports", 8, "--warm_up", 500, "--replay", 1000, "--hidden", 32, "--coverage", 2,
-               "--checkpoint", 0, "--threads", 1, "--calibrated", 0]
+# ---------------------------------------------------------------- where people run it
+
+ODD = dict(LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0", MPLBACKEND="module://matplotlib_inline.backend_inline")
 
 
-def versions(fork, file, number):
-    """Wait until the running script has written the file anew so many times."""
-    seen = set()
-    fork.wait_for(lambda: seen.add(os.path.exists(file) and os.stat(file).st_mtime_ns) or len(seen) > number)
+@pytest.mark.parametrize("name, flags", [(S1, ["--trajectories", 500]), (S4, ["--help"])])
+def test_another_folder_a_c_locale_and_a_notebooks_backend(name, flags, tmp_path):
+    done = cli(name, *([*flags, "--out", tmp_path / "new"] if name == S1 else flags), cwd=tmp_path, **ODD)
+    assert done.returncode == 0 and not done.stderr
+    if name == S1:
+        assert (tmp_path / "new/figures/fig09_dataset.png").stat().st_size > 10_000
+        done.stdout.encode("ascii")
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A folder in which stages 1 to 3 ran, their trainings uninterrupted: the reference of what follows."""
-    out = tmp_path_factory.mktemp("made")
-    fork = Fork(out)  # of another Python, with another hash seed, than the ones that are killed
-    for name, flags in ((S1, TINY_DATA), (S2, TINY_VAE)):
-        done = fork(name, "--out", out, *flags)
-        assert done.returncode == 0, done.stderr
-    fork.start(S3, "--out", out, *TINY_POLICY)
-    fork.wait_for((out / "runs/policy_ant_semi_seed0.pt").exists)
-    fork.end(signal.SIGKILL)  # to measure would take longer than this training
-    fork.close()
-    return out
+def shell(command):
+    return subprocess.run(["bash", "-c", command], capture_output=True, text=True)
 
 
-@pytest.fixture
-def copy(made, tmp_path):
-    shutil.copytree(made / "runs", tmp_path / "runs")
-    return tmp_path
+def test_output_into_head(tmp_path):
+    done = shell(f"{sys.executable} -u {ROOT}/{S1}.py --out {tmp_path} --trajectories 500 | head -n 1")
+    assert done.stdout.startswith("Table 1") and done.stderr == ""
 
 
-# ---------------------------------------------------------------- kill -9
-
-@pytest.mark.parametrize("name, kind, experiment, flags, progress, every, last, pause", [
-    (S2, "wetvae", "main", TINY_VAE, "epoch", 1, 36, 0.03), (S3, "policy", "ant_semi", TINY_POLICY, "updates", 16, 128, 0.4)])
-def test_training_killed_five_times_ends_with_the_same_bits(name, kind, experiment, flags, progress, every, last, pause, made, fork, copy):
-    """Each kill comes a random pause after a random one of the checkpoints; two of the five while another one is being written."""
-    for path in (copy / "runs").glob(f"{kind}*"):
-        path.unlink()
-    file = copy / "runs" / common.artifact_name(f"{kind}-checkpoint", experiment, 0)
-    partial, rng, reached = f"{file}.partial", np.random.default_rng(1), [0]
-    for kill, moment in enumerate(sorted(rng.integers(last // every - 2, size=5))):
-        fork.start(name, "--out", copy, "--resume", "true", *flags)
-        fork.wait_for(lambda: file.name in fork.streams[0].read_text())  # it says what it goes on from: now it trains
-        versions(fork, file, moment - reached[-1] // every)
-        time.sleep(rng.uniform(0, pause))
-        if kill % 2:
-            versions(fork, partial, 1)
-        done = fork.end(signal.SIGKILL)
-        assert done.returncode == -signal.SIGKILL, f"finished before kill {kill + 1}: make the training longer; {done.stderr}"
-        if file.exists():
-            reached.append(common.load(copy, f"{kind}-checkpoint", experiment, 0)[progress])  # whole, whatever the moment
-    assert reached == sorted(reached) and len(set(reached)) > 3
-    fork.start(name, "--out", copy, "--resume", "true", *flags)
-    fork.wait_for((copy / "runs" / common.artifact_name(kind, experiment, 0)).exists)
-    done = fork.end(number := 0 if kind == "wetvae" else signal.SIGKILL)
-    assert done.returncode == -number and not os.path.exists(partial), done.stderr
-    for part in (kind, f"{kind}-checkpoint"):
-        whole, cut = (common.load(out, part, experiment, 0) for out in (made, copy))
-        for content in (whole, cut):  # compare all but the clock, and the flags --out and --resume
-            for row in [content, *content.get("curve", [])]:
-                for entry in ("seconds", "minutes", "config", "sha256"):
-                    row.pop(entry, None)
-        assert [key for key in whole if common.checksum({key: whole[key]}) != common.checksum({key: cut[key]})] == []
+def test_a_full_disk_is_one_line_and_the_old_file_stays(tmp_path):
+    (tmp_path / "dataset_main_seed0.npz").write_bytes(b"before")
+    done = shell(f"ulimit -f 40; exec {sys.executable} {ROOT}/{S1}.py --out {tmp_path}")  # no file beyond 40 KiB
+    assert one_line(done, 1) and "cannot write" in done.stderr and "--out" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["dataset_main_seed0.npz"]
+    assert (tmp_path / "dataset_main_seed0.npz").read_bytes() == b"before"
 
 
-def test_two_seeds_differ(fork, copy):
-    """That the same seed gives the same bits is what the five kills show; another seed gives others."""
-    assert fork(S2, "--out", copy, *TINY_VAE, "--epochs", 1, "--seed", 1).returncode == 0
-    one, other = (common.load(copy, "wetvae", "main", seed)["decoder"] for seed in (0, 1))
-    assert not torch.equal(one["cell.weight_ih"], other["cell.weight_ih"])
-
-
-# ---------------------------------------------------------------- damage
-
-@pytest.mark.parametrize("kind, experiment", [("dataset", "main"), ("wetvae", "main"), ("wetvae-checkpoint", "main"), ("policy", "ant_semi"),
-                                              ("policy-checkpoint", "ant_semi")])
-def test_damaged_bytes_are_refused_or_harmless(kind, experiment, copy, capsys):
-    """60 seeded damages of each kind of artifact: flipped bits, truncations, swapped blocks."""
-    path = copy / "runs" / common.artifact_name(kind, experiment, 0)
-    original, whole = path.read_bytes(), common.load(copy, kind, experiment, 0)
-    rng, harmless = np.random.default_rng(0), 0
-    for case in range(60):
-        data = bytearray(original)
-        at = int(rng.integers(len(data)) if case % 2 else rng.integers(min(4000, len(data))))  # half of them in the first headers
-        if case % 3 == 0:
-            data[at] ^= 1 << int(rng.integers(8))
-        elif case % 3 == 1:
-            data = data[:at]
-        else:
-            other, size = int(rng.integers(len(data) - 64)), int(rng.integers(1, 64))
-            at = min(at, len(data) - 64)
-            data[at:at + size], data[other:other + size] = data[other:other + size], data[at:at + size]
-        path.write_bytes(data)
-        capsys.readouterr()
-        try:
-            content = common.load(copy, kind, experiment, 0)
-        except SystemExit as end:
-            error = capsys.readouterr().err
-            assert end.code == 2 and error.count("\n") == 1 and "make it with: python 0" in error, error
-        else:
-            harmless += 1
-            assert common.checksum(content) == common.checksum(whole) == whole["sha256"]
-    assert harmless < 40
-
-
-def test_numbers_that_are_not_finite_are_refused(tmp_path, capsys):
-    common.save(tmp_path, "policy", "ant_semi", 0, {}, actor=dict(w=torch.tensor([1.0, float("nan")])))
-    with pytest.raises(SystemExit) as end:
-        common.load(tmp_path, "policy", "ant_semi", 0)
-    assert end.value.code == 2 and "not finite" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("name, kind, flags", [(S2, "wetvae", [*TINY_VAE, "--learning_rate", 1e18]),
-                                               (S3, "policy", [*TINY_POLICY, "--learning_rate", 1e30])])
-def test_a_loss_that_is_not_finite_is_named_and_nothing_is_overwritten(name, kind, flags, fork, copy):
-    before = {path.name: path.read_bytes() for path in (copy / "runs").iterdir()}
-    done = fork(name, "--out", copy, *flags)
-    assert done.returncode == 1 and done.stderr.count("\n") == 1, done.stderr
-    assert f"{kind}-checkpoint_" in done.stderr and "--resume true" in done.stderr and " is " in done.stderr
-    assert before == {path.name: path.read_bytes() for path in (copy / "runs").iterdir()}
-
-
-def test_a_full_disk_is_one_line_and_earlier_artifacts_stay(copy):
-    before = (copy / "runs/dataset_main_seed0.npz").read_bytes()
-    done = subprocess.run(["bash", "-c", f"ulimit -f 40; exec {sys.executable} {ROOT}/01_make_dataset.py --out {copy}"],
-                          capture_output=True, text=True)  # no file beyond 40 KiB: the data set cannot be written
-    assert done.returncode == 1 and done.stderr.count("\n") == 1 and "cannot write" in done.stderr and "--out" in done.stderr, done.stderr
-    assert (copy / "runs/dataset_main_seed0.npz").read_bytes() == before and not list((copy / "runs").glob("*.partial"))
-
-
-# ---------------------------------------------------------------- rubbish
-
-FLAGS1 = ("--experiment --seed --out --trajectories --length --factors --speed_low --speed_high --direction --curvature --acceleration "
-          "--straight")
-RUBBISH = [  # script, flags, exit code, the line without the script's name; OUT stands for the folder given with --out
-    (S1, "--nonsense 1", 2, f"unknown flag --nonsense; allowed: {FLAGS1}"),
-    (S1, "surplus", 2, f"unknown flag surplus; allowed: {FLAGS1}"),
-    (S1, "--seed=1 --trajectory 5", 2, f"unknown flag --trajectory; allowed: {FLAGS1}"),
-    (S1, "--trajectories many", 2, "argument --trajectories: invalid whole number, 0 or more value: 'many'; see --help"),
-    (S1, "--trajectories 2.5", 2, "argument --trajectories: invalid whole number, 0 or more value: '2.5'; see --help"),
-    (S1, "--seed -1", 2, "argument --seed: invalid whole number, 0 or more value: '-1'; see --help"),
-    (S1, "--direction nan", 2, "argument --direction: invalid number, 0 or more value: 'nan'; see --help"),
-    (S1, "--straight inf", 2, "argument --straight: invalid number, 0 or more value: 'inf'; see --help"),
-    (S1, "--length", 2, "argument --length: expected one argument; see --help"),
-    (S1, "--experiment nope", 2, "unknown experiment 'nope'; allowed: main full polar speed_acc four_factors"),
-    (S1, "--trajectories 0", 2, "--trajectories and --length must be at least 1, --straight at most 1, --speed_low at most --speed_high"),
-    (S1, "--factors direction", 2, "--factors 'direction' must name speed, and may name direction, curvature and acceleration, each once"),
-    (S1, "--straight 1.5", 2, "--trajectories and --length must be at least 1, --straight at most 1, --speed_low at most --speed_high"),
-    (S2, "--experiment Main", 2, "unknown experiment 'Main'; allowed: main seeds beta_gamma polar cartesian speed_acc four_factors full"),
-    (S2, "--train maybe", 2, "argument --train: invalid true or false value: 'maybe'; see --help"),
-    (S2, "--labels colour", 2, "no weak label 'colour'; allowed: speed direction curvature angle x y velocity acceleration"),
-    (S2, "", 2, "no dataset_main_seed0.npz in runs/ or pretrained/; make it with: python 01_make_dataset.py --experiment main --seed 0"),
-    (S2, "--data_seed 7", 2, "no dataset_main_seed7.npz in runs/ or pretrained/; make it with: python 01_make_dataset.py --experiment main --seed 7"),
-    (S3, "--experiment ant_demi", 2, "unknown experiment 'ant_demi'; allowed: ant_semi ant_full half_cheetah ant_dads ant_sectar "
-     "ant_sectar_no_explorer"),
-    (S3, "--decoder nope", 2, "no wetvae_nope_seed0.pt in runs/ or pretrained/; make it with: python 02_train_wetvae.py --experiment nope --seed 0"),
-    (S3, "--train false --seed 98", 2,
-     "no policy_ant_semi_seed98.pt in runs/ or pretrained/; make it with: python 03_train_policy.py --experiment ant_semi --seed 98"),
-    (S3, "--warm_up 5", 2, "--updates must be at least 1 and --warm_up 5 must lie between --batch 256 and --replay 1000000"),
-    (S3, "--updates 0", 2, "--updates must be at least 1 and --warm_up 10000 must lie between --batch 256 and --replay 1000000"),
-    (S4, "--mazes maze3", 2, "unknown maze 'maze3'; allowed: maze1 maze2"),
-    (S4, "--rewards shaped", 2, "unknown reward 'shaped'; allowed: dense sparse"),
-    (S4, "--predictions oracle", 2, "unknown prediction 'oracle'; allowed: relation decoder"),
-    (S4, "--objectives best", 2, "unknown objective 'best'; allowed: final sum"),
-    (S4, "--trials 0", 2, "--trials, --samples, --hold and --length must be at least 1, and --episode at least hold x length"),
-    (S4, "--episode 100", 2, "--trials, --samples, --hold and --length must be at least 1, and --episode at least hold x length"),
-    (S4, "--policy_seed 99", 2,
-     "no policy_ant_semi_seed99.pt in runs/ or pretrained/; make it with: python 03_train_policy.py --experiment ant_semi --seed 99"),
-]
-
-
-@pytest.mark.parametrize("name, flags, code, line", RUBBISH, ids=[f"{row[0][:2]} {row[1]}" for row in RUBBISH])
-def test_rubbish_gets_its_one_line(name, flags, code, line, tmp_path, capsys, monkeypatch):
-    """Each runs the script's own main part, in this process: starting Python thirty times would take a minute."""
-    out = [] if flags.startswith("surplus") else ["--out", str(tmp_path)]
-    monkeypatch.setattr(sys, "argv", [str(ROOT / f"{name}.py"), *out, *flags.split()])
-    with pytest.raises(SystemExit) as end:
-        runpy.run_path(str(ROOT / f"{name}.py"), run_name="__main__")
-    captured = capsys.readouterr()
-    assert (end.value.code, captured.err) == (code, f"{name}.py: {line}\n")
-    assert not list(tmp_path.rglob("*.p*"))  # nothing was written
-
-
-def test_rubbish_from_a_real_shell(tmp_path):
-    done = cli(S4, "--out", tmp_path, "--samples", "three")
-    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1
-
-
-def test_a_file_where_a_folder_is_needed(fork, tmp_path):
-    (tmp_path / "runs").write_text("in the way")
-    done = fork(S1, "--out", tmp_path, *TINY_DATA)
-    assert done.returncode == 1 and done.stderr.count("\n") == 1 and "cannot write" in done.stderr and "--out" in done.stderr
-
-
-@pytest.mark.parametrize("name, flags, line", [
-    (S2, [*TINY_VAE, "--train", "false", "--labels", "speed"], "wetvae_main_seed0.pt was made with --labels speed direction curvature, not speed"),
-    (S3, [*TINY_POLICY, "--hidden", 48, "--resume", "true"], "policy-checkpoint_ant_semi_seed0.pt was made with --hidden 32, not 48"),
-    (S4, ["--policy_seed", 5], "policy_ant_semi_seed5.pt has kind 'wetvae' where 'policy' is needed")])
-def test_an_artifact_made_with_other_flags_or_of_another_kind_is_refused(name, flags, line, fork, copy):
-    shutil.copy(copy / "runs/wetvae_main_seed0.pt", copy / "runs/policy_ant_semi_seed5.pt")
-    done = fork(name, "--out", copy, *flags)
-    assert done.returncode == 2 and line in done.stderr and done.stderr.count("\n") == 1, done.stderr
+@pytest.mark.parametrize("stage", ["s1", "s2", "s3", "s4"])
+def test_a_file_where_a_folder_is_needed(stage, request, inside, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    done = inside(request.getfixturevalue(stage), "--out", tmp_path / "file" / "runs")
+    assert one_line(done, 1) and "cannot write" in done.stderr and "--out" in done.stderr
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_and_sigterm_end_with_one_line(number, fork, copy):
-    fork.start(S2, "--out", copy, *TINY_VAE, "--epochs", 2000)
-    fork.wait_for(lambda: "\nepoch" in fork.streams[0].read_text())
+def test_ctrl_c_and_sigterm_end_with_one_line(number, fork, out):
+    fork.start(S3, *tiny(out, updates=10 ** 6, reports=10 ** 6))
+    fork.wait_for(lambda: "\nupdates" in fork.streams[0].read_text())
     done = fork.end(number)
-    assert done.returncode != 0 and "stopped by hand" in done.stderr and "--resume true" in done.stderr, done.stderr
-    assert done.stderr.strip().count("\n") == 0
+    assert done.returncode != 0 and len(done.stderr.strip().splitlines()) == 1 and "--resume true" in done.stderr, done.stderr
+
+
+def test_killed_three_times_it_ends_with_the_same_bits(fork, out):
+    """kill -9 at random moments, each after new checkpoints; the file is whole whenever it is looked at."""
+    flags = [*tiny(out, updates=160, checkpoint=0, episode=10)]
+    policy, file = out / "policy_ant_semi_seed0.pt", out / "policy-checkpoint_ant_semi_seed0.pt"
+
+    def train_to_the_end():
+        fork.start(S3, *flags, "--resume", "true")
+        fork.wait_for(policy.exists)
+        fork.end(signal.SIGKILL)  # what comes is measured and drawn
+        found = outcome(out, "ant_semi")
+        policy.unlink()
+        file.unlink()
+        return found
+    whole, reached = train_to_the_end(), []
+    for _ in range(3):
+        fork.start(S3, *flags, "--resume", "true")
+        seen = set()
+        fork.wait_for(lambda seen=seen: seen.add(file.exists() and file.stat().st_mtime_ns) or len(seen) > 4)
+        assert fork.end(signal.SIGKILL).returncode == -signal.SIGKILL
+        reached.append(common.load(out, "policy-checkpoint", "ant_semi", 0)["numbers"][1])
+    assert reached == sorted(set(reached)) and reached[-1] < 30, "finished before the last kill"
+    assert same(whole, train_to_the_end())
+
+
+# ---------------------------------------------------------------- what makes no sense
+
+@pytest.mark.parametrize("flags, message", [
+    ("--decoder polar", "the decoder polar has axes x y"),
+    ("--decoder speed_acc", "predicts 1 coordinates"),
+    ("--experiment ant_dads --decoder speed_acc", "predicts 1 coordinates"),
+    ("--experiment half_cheetah --decoder main", "predicts 2 coordinates"),
+    ("--experiment half_cheetah --base_frame true", "--base_frame false"),
+    ("--experiment ant_sectar --z_dim 2", "--z_dim is at least 3"),
+    ("--experiment ant_dads --robot half_cheetah", "--robot ant"), ("--experiment ant_dads --z_dim 3", "--z_dim 2"),
+    ("--decoder nope", "python 02_train_wetvae.py --experiment nope --seed 0"),
+    ("--decoder_seed 7", "python 02_train_wetvae.py --experiment main --seed 7"),
+    ("--method ppo", "--method is wedis, dads or sectar"), ("--robot dog", "--robot is ant or half_cheetah"),
+    ("--train false --seed 98", "python 03_train_policy.py --experiment ant_semi --seed 98"),
+    ("--discount 1", "below 1"), ("--relabelled 2", "at most 1"),
+    ("--skill_steps 7", "--skill_steps must divide --episode"), ("--replay 79", "--replay"),
+    ("--updates 0", "--updates"), ("--multi_run 5", "2 numbers")])
+def test_03_ends_in_one_line_before_training(flags, message, s3, inside, out, monkeypatch):
+    monkeypatch.setattr(s3.Run, "__init__", lambda *_: pytest.fail("it trains"))
+    done = inside(s3, *tiny(out), *flags.split())
+    assert one_line(done, 2) and message in done.stderr, done.stderr
+
+
+@pytest.mark.parametrize("experiment", ["ant_semi", "ant_dads", "ant_sectar"])
+def test_a_loss_that_is_not_finite_overwrites_nothing(experiment, s3, inside, out):
+    flags = [*tiny(out, updates=320), "--experiment", experiment, "--checkpoint", 1e9]
+    before = common.save(out, "policy", experiment, 0, {}, v=1).read_bytes()
+    done = inside(s3, *flags, "--learning_rate", 1e30)
+    assert one_line(done, 1) and "not finite" in done.stderr and "--resume true" in done.stderr, done.stderr
+    assert (out / f"policy_{experiment}_seed0.pt").read_bytes() == before
+
+
+STAGE = script(S3)
+BASELINE = dict(Z_DIM="ant_sectar", RECENT="ant_sectar", MODEL_BATCH="ant_dads", PRIOR_SAMPLES="ant_dads", EXPLORE="ant_sectar",
+                KL_WEIGHT="ant_sectar")
+
+
+def changes(name, value):
+    """What a reader might write in the file instead of a value."""
+    if isinstance(value, bool):
+        return [not value]
+    if isinstance(value, str):
+        return ["nonsense"] if name != "OUT" else []
+    if isinstance(value, tuple):
+        return [tuple(2 * part for part in value), (0, 0), (-1, 3), (1.5, 2.5)]
+    return [2 * value, 0, -3]
+
+
+CONSTANTS = [name for name, value in vars(STAGE).items() if name.isupper() and isinstance(value, (bool, int, float, str, tuple))]
+
+
+@pytest.mark.parametrize("name", CONSTANTS)
+def test_every_constant_of_03_can_be_changed_in_the_file(name, inside, out, monkeypatch):
+    """It works, or ends in one line: never a traceback."""
+    experiment = BASELINE.get(name, "ant_semi")
+    small = {key.upper(): common.convert(str(value), getattr(STAGE, key.upper()), True, key) for key, value in TINY.items()}
+    for key, value in (small | dict(OUT=str(out), EXPERIMENT=experiment)).items():
+        monkeypatch.setattr(STAGE, key, value)
+    monkeypatch.setitem(STAGE.EXPERIMENTS, experiment, dict(METHOD=STAGE.EXPERIMENTS[experiment].get("METHOD", "wedis"), Z_DIM=4 if "sectar" in experiment else 2))
+    STAGE.EXPERIMENTS[experiment].pop(name, None)
+    monkeypatch.setattr(STAGE, "calibrate_relation", lambda *_: dict(curvature=0.2))  # half of the time
+    if name not in ("DIRECTIONS", "FIGURE", "SINGLE_RUN", "MULTI_RUN"):
+        monkeypatch.setattr(STAGE, "draw_skills", lambda policy: None)
+    for value in changes(name, getattr(STAGE, name)):
+        monkeypatch.setattr(STAGE, name, value)
+        done = inside(STAGE)
+        assert done.returncode == 0 and not done.stderr or one_line(done), f"{name} = {value}: {done.stderr}"
