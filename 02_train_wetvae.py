@@ -246,6 +246,8 @@ def main():
             if name not in config or (name in ("HIDDEN", "BATCH", "EPOCHS") and value < 1):
                 fault = "must be at least 1" if name in config else "is no constant of this file"
                 stop(f"{name} = {value} {fault} (model {key!r} of {EXPERIMENT})")
+        if settings["LEARNING_RATE"] < 0:
+            stop("--learning_rate must be 0 or more")
     if TRAIN:
         dataset = load(OUT, "dataset", DATA, DATA_SEED)
         x = torch.from_numpy(np.diff(dataset["trajectories"], axis=1))  # displacements, App. A.1.2

@@ -4,8 +4,8 @@ Reads runs/wetvae_*.pt of stage 2. A skill z_single asks for a step: the decoder
 called the command c. The reward is the decoder's log-likelihood of the step that the robot makes (Eq. 6).
 Writes runs/policy_<experiment>_seed<seed>.pt, Fig 5, 14 (15, 16), the learning curve and a row of
 runs/results/policies.csv.
-Takes 21 minutes on two cores that were busy with other work, 100,000 updates. Expect, n = 1 (seed 0): tracking
-error 0.15 in open loop, 0.18 in closed loop; closed loop, 0.3 m off after a skill of 200 steps (median).
+Takes 21 minutes on two cores that were busy with other work, 100,000 updates. Expect, n = 1 (seed 0):
+tracking error 0.15 in open loop, 0.18 in closed loop; there 0.3 m off after a skill of 200 steps (median).
 """
 import copy
 import math

@@ -266,56 +266,47 @@ def dot(place, colour):
 
 def drive(u):
     """Sliders in a web page command the Ant in real time. mujoco serves the page, to this machine alone."""
-    robots, model, pages, trail = common.Robots(maze_spec(u), 1), maze_spec(u).compile(), [], []
-    robots.qpos[0, :2] += u.start
-    names, pool = ["z_" + name for name in u.policy.names], skill_pool(u)
-    steps, age, asked = 0, 0, None  # age: of the skill, steps
-    hand = SimpleNamespace(mode="stand still", z=dict.fromkeys(names, 0.0), closed=True, text="", geoms=[])
-    start = due = time.monotonic()
+    robots, model, pages, steps = common.Robots(maze_spec(u), 1), maze_spec(u).compile(), [], 0
+    data = mujoco.MjData(model)
+    z, pool, start = {"z_" + name: 0.0 for name in u.policy.names}, skill_pool(u), time.monotonic()
+    hand = SimpleNamespace(mode="start again", z=z, closed=True, text="", geoms=[])  # both threads use it
     try:
         from mujoco.studio import launch_web, messages, plugin, viewer_protocol, web_viewer
         from mujoco.studio.dear_imgui import dear_imgui as gui
-
         class Panel(plugin.ViewerPlugin):  # the viewer's thread calls it, 60 times a second, page or no page
             @messages.handler
             def look(self, event: messages.PostModelEvent):
                 host, port = self.viewer._http_sock.getsockname()[:2]
                 if host != "127.0.0.1":
                     raise RuntimeError("it would listen beyond this machine")
-                camera = self.viewer.camera
-                camera.type, camera.distance = 1, 12  # 1: it follows a body
-                camera.trackbodyid = model.body("torso").id
+                camera, torso = self.viewer.camera, model.body("torso").id
+                camera.type, camera.distance, camera.trackbodyid = 1, 12, torso  # 1: it follows the Ant
                 print(f"drive the Ant at http://{host}:{port}/ (Ctrl-C ends it)", flush=True)
-
             @messages.handler
             def build(self, event: messages.BuildGuiEvent):
                 gui.Begin("drive the Ant", True, int(gui.WindowFlags.AlwaysAutoResize))
                 z = {name: gui.SliderFloat(name, at, -1.5, 1.5, "%.2f")[1] for name, at in hand.z.items()}
                 if z != hand.z:
                     hand.z, hand.mode = z, "by hand"
-                for mode in ("stand still", "start again", "plan to the goal"):
-                    if gui.Button(mode):
-                        hand.mode = mode
-                    gui.SameLine()
+                modes = [m for m in ("stand still", "start again", "plan to the goal") if gui.Button(m)]
+                hand.mode = modes[0] if modes else hand.mode
                 hand.closed = gui.Checkbox("closed loop", hand.closed)[1]
                 gui.TextUnformatted(hand.text)
                 gui.End()
                 self.viewer.extra_geoms[:] = hand.geoms
-
         # The trap: the viewer asks for no password and listens on every interface. Make that 127.0.0.1.
         bind = web_viewer.web_server.bind_public_socket
         web_viewer.web_server.bind_public_socket = lambda host, port: bind("127.0.0.1", port)
         web_viewer.print = web_viewer._print_url_banner = lambda *words, **options: None
-        logging.getLogger("mujoco.studio").setLevel("CRITICAL")  # its errors are raised as well
+        logging.getLogger().setLevel("CRITICAL")  # errors of the viewer are raised as well
         logging.getLogger("WebServer").addFilter(pages.append)  # who comes and goes; None hides it
         with launch_web.launch(viewer_protocol.ViewerConfig(http_port=PORT), plugins=[Panel()]) as handle:
-            data = mujoco.MjData(model)
             handle.set_model(model, data=data)
             while handle.is_running() and not 0 < SECONDS <= time.monotonic() - start:
                 if pages and "(0 total)" in pages[-1].getMessage() and time.time() > pages[-1].created + 10:
                     break  # the last page is closed; one that reloads is back sooner
                 if hand.mode == "start again":
-                    hand.mode, asked, trail = "stand still", None, []
+                    hand.mode, asked, age, trail = "stand still", None, 0, []
                     robots.reset([0])
                     robots.qpos[0, :2] += u.start
                 place, mode, z = robots.place()[0], hand.mode, hand.z  # once: the page changes them
@@ -327,20 +318,17 @@ def drive(u):
                     if mode == "plan to the goal":
                         skill = plan(u, "dense", u.samples[0], u.planned_dense, pool, place)[0][None]
                     c = going * commands_of(u.policy, skill, u.length)[0].repeat_interleave(u.hold, 0)
-                command, error = c[age][None], (reference - place).norm()
-                if hand.closed:
-                    command = common.closed_loop(command, reference[None], robots, u.policy.scale)
+                command = common.closed_loop(c[age][None], reference[None], robots, u.policy.scale)
+                command = command if hand.closed else c[age][None]
                 robots.step(u.policy.actor.act(robots.observe(), command, deterministic=True).numpy())
-                hand.text = f"command {command.norm():.2f} of 1, tracking error {error:.2f} m"
+                hand.text = f"command {command.norm():.2f}, tracking error {(reference - place).norm():.2f} m"
                 age, steps, reference = age + 1, steps + 1, reference + u.policy.scale * c[age]
-                if steps % 10 == 0:
-                    trail = [*trail[-200:], dot(place, RED)]
+                trail.append(place)
                 ahead = place + u.policy.scale * c.roll(-age, 0).cumsum(0)  # the skill is repeated
-                hand.geoms = trail + [dot(there, BLUE) for there in ahead[::10]]
+                hand.geoms = [dot(p, RED) for p in trail[::10][-200:]] + [dot(p, BLUE) for p in ahead[::10]]
                 data.qpos[:] = robots.qpos[0]
                 handle.sync()
-                due = max(due + 0.05, time.monotonic() - 0.5)  # after a pause it does not race
-                time.sleep(max(0, due - time.monotonic()))
+                time.sleep(max(0, start + 0.05 * steps - time.monotonic()))
     except KeyboardInterrupt:
         pass
     except (ImportError, AttributeError, TypeError, RuntimeError, OverflowError) as error:

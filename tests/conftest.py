@@ -1,5 +1,5 @@
-"""Loads the numbered scripts as modules (their names are no identifiers) and runs them: cli as a user would, fork without
-the seconds that the imports take, inside in this process. Plus tiny decoders and the flags of a tiny policy training."""
+"""Loads the numbered scripts as modules (their names are no identifiers) and runs them: cli as a user would, fork
+without the seconds that the imports take, inside in this process. Tiny decoders, flags of a tiny policy training."""
 import importlib.util
 import itertools
 import json
@@ -35,8 +35,8 @@ for number, name in (("s1", S1), ("s2", S2), ("s3", S3), ("s4", S4)):
 
 # ---------------------------------------------------------------- a tiny policy training
 
-TINY = dict(updates=24, robots=8, skill_steps=5, episode=20, warm_up=80, replay=800, batch=16, hidden=16, reports=2, starts=4,
-            noisy=2, traversal=3, single_run="1 4", multi_run="2 2", threads=1, directions=3)
+TINY = dict(updates=24, robots=8, skill_steps=5, episode=20, warm_up=80, replay=800, batch=16, hidden=16, reports=2,
+            starts=4, noisy=2, traversal=3, single_run="1 4", multi_run="2 2", threads=1, directions=3)
 
 
 def tiny(out, **changed):
@@ -49,7 +49,8 @@ def out(tmp_path):
     """A folder with decoders, untrained: the three that 03 uses, and one of x and y."""
     three = ["speed", "direction", "curvature"]
     for name, x_dim, names, circle in (("main", 2, three, None), ("full_circle", 2, three, 1),
-                                       ("speed_acc", 1, ["speed", "acceleration"], None), ("polar", 2, ["x", "y"], None)):
+                                       ("speed_acc", 1, ["speed", "acceleration"], None),
+                                       ("polar", 2, ["x", "y"], None)):
         torch.manual_seed(0)
         common.save(tmp_path, "wetvae", name, 0, {}, decoder=common.pack(common.Decoder(len(names), x_dim, 16, circle)),
                     names=names, ranges={name: (-1.0, 1.0) for name in names}, length=5)
@@ -118,13 +119,13 @@ for line in sys.stdin:
 
 
 class Fork:
-    """Runs a script like cli, but forked from a fresh Python that has imported torch, mujoco and matplotlib and done nothing
-    else: a process of its own, to be interrupted and killed, without the seconds that the imports take. One at a time."""
+    """Runs a script like cli, but forked from a fresh Python that has imported torch, mujoco and matplotlib and done
+    nothing else: a process of its own, to be interrupted and killed, without the time of imports. One at a time."""
 
     def __init__(self, folder):
         self.streams, self.code = [folder / "stdout", folder / "stderr"], 0
-        self.server = subprocess.Popen([sys.executable, "-c", SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-                                       env=os.environ | dict(PYTHONPATH=str(ROOT)))
+        self.server = subprocess.Popen([sys.executable, "-c", SERVER], stdin=subprocess.PIPE,
+                                       stdout=subprocess.PIPE, text=True, env=os.environ | dict(PYTHONPATH=str(ROOT)))
 
     def ask(self, *request):
         print(json.dumps(request), file=self.server.stdin, flush=True)

@@ -1,5 +1,6 @@
-"""Stage 3, the baselines: one pass of each training loop over a replay buffer made by hand, against torch.distributions and
-plain loops. Their trainings from the command line, and that these resume with the same bits: test_policy.py."""
+"""Stage 3, the baselines: one pass of each training loop over a replay buffer made by hand, against
+torch.distributions and plain loops.
+Their trainings from the command line, and that these resume with the same bits: test_policy.py."""
 import math
 from types import SimpleNamespace
 
@@ -39,21 +40,23 @@ class Sac:
 
 @pytest.fixture
 def dads(s3):
-    """A run whose steps are drawn from 300 stored ones; q has a normalisation and likelihoods unlike those at the start."""
+    """A run whose steps are drawn from 300 stored ones; q has a normalisation and means unlike those at the start."""
     torch.manual_seed(0)
-    vars(s3).update(METHOD="dads", PRIOR_SAMPLES=30, RELABELLED=0.0, UPDATES_PER_STEP=1, UPDATES=1, BATCH=64, MODEL_BATCH=50)
+    vars(s3).update(METHOD="dads", PRIOR_SAMPLES=30, RELABELLED=0.0, UPDATES_PER_STEP=1, UPDATES=1, BATCH=64,
+                    MODEL_BATCH=50)
     q = common.SkillDynamics(2, 2, 16)
     q.x_mean.copy_(torch.tensor([0.3, -0.1]))
     q.x_std.copy_(torch.tensor([0.5, 2.0]))
     with torch.no_grad():
         q.net[4].weight *= 10
-    stored = torch.randn(300, 27), torch.randn(300, 8), torch.randn(300, 27), 0.05 * torch.randn(300, 2), torch.rand(300, 2) * 2 - 1
+    stored = [torch.randn(300, n) for n in (27, 8, 27)] + [0.05 * torch.randn(300, 2), torch.rand(300, 2) * 2 - 1]
 
     def sample(n, recent=None):
         pick = torch.randint(300, (n,))
         return [part[pick] for part in stored]
-    return SimpleNamespace(decoder=q, sac=Sac(), sample=sample, new_skills=lambda: True, warm=lambda: True, act=lambda z: None,
-                           collect=lambda: None, adam=torch.optim.SGD(q.parameters(), lr=0.0), losses={}, stored=stored)
+    return SimpleNamespace(decoder=q, sac=Sac(), sample=sample, new_skills=lambda: True, warm=lambda: True,
+                           act=lambda z: None, collect=lambda: None,
+                           adam=torch.optim.SGD(q.parameters(), lr=0.0), losses={}, stored=stored)
 
 
 def information(q, displacement, z, others):
@@ -78,14 +81,16 @@ def test_one_pass_of_dads_learns_q_and_pays_the_information(s3, dads):
     q = dads.decoder
     x, x2, r = dads.sac.kept()
     rows = (x[:, None, :27] == dads.stored[0]).all(2).nonzero()[:, 1]  # which of the stored steps these are
-    assert torch.equal(x[:, 27:], dads.stored[4][rows]) and torch.equal(x2, torch.cat([dads.stored[2][rows], x[:, 27:]], 1))
+    assert torch.equal(x[:, 27:], dads.stored[4][rows])
+    assert torch.equal(x2, torch.cat([dads.stored[2][rows], x[:, 27:]], 1))
     torch.manual_seed(1)  # the same draws again: skills of the robots, q's batch, the batch, relabelling, the prior
     torch.rand(s3.ROBOTS, 2)
     pick = torch.randint(300, (50,))
     torch.randint(300, (64,))
     torch.rand(64, 1), torch.rand(64, 2)
     others = torch.rand(30, 2) * 2 - 1
-    torch.testing.assert_close(r, s3.REWARD_SCALE * information(q, dads.stored[3][rows], x[:, 27:], others).float(), atol=1e-3, rtol=1e-3)
+    expected = s3.REWARD_SCALE * information(q, dads.stored[3][rows], x[:, 27:], others).float()
+    torch.testing.assert_close(r, expected, atol=1e-3, rtol=1e-3)
     assert r.std() > 0.01
     displacement, z = dads.stored[3][pick], dads.stored[4][pick]
     expected = -mixture(q, z).log_prob((displacement / 0.1 - q.x_mean) / q.x_std).mean()
@@ -110,7 +115,7 @@ def test_skill_dynamics_learn_what_skills_do(s3, dads):
 
 @pytest.fixture
 def sectar(s3):
-    """A run with a replay buffer that is full: 4 trajectories of 6 robots, 5 steps each. A state holds who made it and when."""
+    """A run with a full replay buffer: 4 trajectories of 6 robots, 5 steps each. A state holds who made it and when."""
     torch.manual_seed(0)
     vars(s3).update(METHOD="sectar", ROBOTS=6, SKILL_STEPS=5, Z_DIM=4, RECENT=60, MODEL_BATCH=40, RELABELLED=0.0,
                     UPDATES_PER_STEP=4, UPDATES=1, BATCH=200, REWARD_SCALE=0.3)
@@ -173,7 +178,8 @@ def test_elbo_of_sectar_equals_torch_distributions(s3, sectar):
     decoded, log_var = (v.detach() for v in sectar.decoder(z, 5))
     p = D.Normal(decoded, (0.5 * log_var).exp().clamp(min=s3.FLOOR_END / 0.1))
     kl = D.kl_divergence(q, D.Independent(D.Normal(torch.zeros(40, 4), 1.0), 1))
-    expected = s3.KL_WEIGHT * kl - p.log_prob(x).sum((1, 2)) - 10 * 0.5 * math.log(2 * math.pi)  # ours leaves the constant out
+    constant = 10 * 0.5 * math.log(2 * math.pi)  # ours leaves it out
+    expected = s3.KL_WEIGHT * kl - p.log_prob(x).sum((1, 2)) - constant
     assert sectar.losses["loss"] == pytest.approx(expected.mean().item(), abs=1e-3)
 
 

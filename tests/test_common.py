@@ -1,4 +1,4 @@
-"""Command line, artifacts and CSV of all stages. What the networks and robots in common.py do is tested with stage 3."""
+"""Command line, artifacts and CSV of all stages. The networks and robots in common.py are tested with stage 3."""
 import multiprocessing
 import os
 import pickle
@@ -30,7 +30,8 @@ SHARE = 1.0           # a share
 FLAG = False          # a switch
 START = (0.0, 1.5)    # x and y
 WORDS = "a b"         # words
-EXPERIMENTS = {{"plain": {{}}, "other": dict(N=7, SHARE=2), "typo": dict(SHRE=1), "bad": dict(N=2.5), "minus": dict(N="-1")}}
+EXPERIMENTS = {{"plain": {{}}, "other": dict(N=7, SHARE=2), "typo": dict(SHRE=1), "bad": dict(N=2.5),
+               "minus": dict(N="-1")}}
 '''
 
 
@@ -56,13 +57,15 @@ def test_flags_override_rows_and_rows_override_constants(flags):
     stage, config, given = flags("--experiment", "other", "--share", "3", "--flag", "True", "--start", "-1 2")
     assert (stage["N"], stage["SHARE"], stage["FLAG"], stage["START"]) == (7, 3.0, True, (-1.0, 2.0))
     assert given == dict(EXPERIMENT="other", SHARE=3.0, FLAG=True, START=(-1.0, 2.0))
-    assert config == {name: stage[name] for name in ("EXPERIMENT", "SEED", "OUT", "N", "SHARE", "FLAG", "START", "WORDS")}
+    assert config == {name: stage[name] for name in "EXPERIMENT SEED OUT N SHARE FLAG START WORDS".split()}
 
 
 @pytest.mark.parametrize("argv, message", [
-    ("--nonsense 1", "unknown flag --nonsense; allowed: --experiment --seed --out --n"), ("surplus", "unknown flag surplus"),
+    ("--nonsense 1", "unknown flag --nonsense; allowed: --experiment --seed --out --n"),
+    ("surplus", "unknown flag surplus"),
     ("--shar 1", "unknown flag --shar"), ("--n many", "--n is 'many', but must be a whole number, 0 or more"),
-    ("--n 2.5", "--n is '2.5', but must be a whole number"), ("--n -1", "--n is '-1'"), ("--share nan", "--share is 'nan'"),
+    ("--n 2.5", "--n is '2.5', but must be a whole number"),
+    ("--n -1", "--n is '-1'"), ("--share nan", "--share is 'nan'"),
     ("--share inf", "--share is 'inf'"), ("--flag maybe", "--flag is 'maybe', but must be true or false"),
     ("--start 1", "--start is '1', but must be 2 numbers"), ("--n", "--n: expected one argument; see --help"),
     ("--experiment nope", "unknown experiment 'nope'; allowed: plain other typo bad minus"),
@@ -85,8 +88,9 @@ def test_artifacts_come_back_as_they_went_and_own_ones_before_shipped_ones(tmp_p
     monkeypatch.setattr(common, "HERE", tmp_path / "repo")
     common.save(tmp_path / "repo/pretrained", "policy", "x", 3, dict(A=1), w=torch.arange(4.0), curve=[dict(a=1.5)])
     common.save(tmp_path / "runs", "dataset", "x", 3, dict(A=1), t=np.eye(2), names=np.array(["speed"]))
-    policy, dataset = common.load(tmp_path / "runs", "policy", "x", 3), common.load(tmp_path / "runs", "dataset", "x", 3)
-    assert torch.equal(policy["w"], torch.arange(4.0)) and policy["curve"] == [dict(a=1.5)] and policy["config"] == dict(A=1)
+    policy, dataset = (common.load(tmp_path / "runs", kind, "x", 3) for kind in ("policy", "dataset"))
+    assert torch.equal(policy["w"], torch.arange(4.0)) and policy["curve"] == [dict(a=1.5)]
+    assert policy["config"] == dict(A=1)
     assert np.array_equal(dataset["t"], np.eye(2)) and dataset["versions"]["numpy"] == np.__version__
     assert "using pretrained/policy_x_seed3.pt" in capsys.readouterr().out.replace(os.sep, "/")
     common.save(tmp_path / "runs", "policy", "x", 3, {}, v=2)
@@ -95,7 +99,8 @@ def test_artifacts_come_back_as_they_went_and_own_ones_before_shipped_ones(tmp_p
 
 
 @pytest.mark.parametrize("kind", ["dataset", "policy"])
-@pytest.mark.parametrize("damage", ["missing", "cut", "byte", "foreign", "foreign archive", "empty", "seed", "kind", "format", "nan"])
+@pytest.mark.parametrize("damage", ["missing", "cut", "byte", "foreign", "foreign archive", "empty", "seed", "kind",
+                                    "format", "nan"])
 def test_damaged_artifacts_are_refused_in_one_line(kind, damage, tmp_path, capsys, monkeypatch):
     make = np.ones if kind == "dataset" else torch.ones
     if damage == "format":

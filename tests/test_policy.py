@@ -1,4 +1,4 @@
-"""Stage 3, WEDIS: robots against Gymnasium and mj_step, networks and SAC against torch.distributions and plain autograd,
+"""Stage 3, WEDIS: robots against Gymnasium and mj_step, networks and SAC against torch.distributions and autograd,
 execution and measures by hand, every row of EXPERIMENTS from training to figures. All networks are tiny."""
 import importlib.util
 import math
@@ -19,10 +19,10 @@ ROWS = list(script(S3).EXPERIMENTS)
 
 # ---------------------------------------------------------------- robots
 
-FIELDS = """nq nv nu nbody njnt ngeom qpos0 body_parentid body_pos body_mass body_inertia body_ipos jnt_type jnt_axis jnt_pos
-jnt_range jnt_limited jnt_stiffness jnt_margin dof_armature dof_damping geom_type geom_size geom_pos geom_quat geom_friction
-geom_condim geom_contype geom_conaffinity geom_margin geom_solref geom_solimp geom_bodyid actuator_trnid actuator_gear
-actuator_ctrlrange actuator_ctrllimited actuator_gainprm actuator_biasprm""".split()
+FIELDS = """nq nv nu nbody njnt ngeom qpos0 body_parentid body_pos body_mass body_inertia body_ipos jnt_type jnt_axis
+jnt_pos jnt_range jnt_limited jnt_stiffness jnt_margin dof_armature dof_damping geom_type geom_size geom_pos geom_quat
+geom_friction geom_condim geom_contype geom_conaffinity geom_margin geom_solref geom_solimp geom_bodyid actuator_trnid
+actuator_gear actuator_ctrlrange actuator_ctrllimited actuator_gainprm actuator_biasprm""".split()
 
 
 @pytest.mark.parametrize("robot", ["ant", "half_cheetah"])
@@ -127,7 +127,8 @@ def test_log_probability_is_that_of_a_transformed_distribution():
 def test_reward_is_equation_6_up_to_its_maximum(s3):
     torch.manual_seed(0)
     mean, log_var, displacement = torch.randn(40, 2), torch.randn(40, 2), 0.1 * torch.randn(40, 2)
-    for floor, std in ((0.0, (log_var.exp() / 20).sqrt()), (10.0, torch.full((40, 2), 10.0))):  # App. A.1.3, then the floor alone
+    # without a floor: App. A.1.3; then a floor above all deviations
+    for floor, std in ((0.0, (log_var.exp() / 20).sqrt()), (10.0, torch.full((40, 2), 10.0))):
         p = D.Independent(D.Normal(mean / 10, std), 1)
         expected = s3.REWARD_SCALE * (p.log_prob(displacement) - p.log_prob(mean / 10))
         torch.testing.assert_close(s3.reward(mean, log_var, displacement, floor), expected, **CLOSE)
@@ -149,7 +150,8 @@ def test_one_update_of_sac_equals_a_plain_version(s3):
     sac, (x, a, x2, r) = small_sac(s3, 1)
     sac.critic_adam = torch.optim.SGD(sac.critics.parameters(), lr=1.0)
     sac.actor_adam = torch.optim.SGD([*sac.actor.parameters(), *sac.value.parameters()], lr=1.0)
-    plain = [nn.Sequential(nn.Linear(10, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, 1)) for _ in range(2)]
+    plain = [nn.Sequential(nn.Linear(10, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, 1))
+             for _ in range(2)]
     for k, net in enumerate(plain):
         for i, layer in enumerate((net[0], net[2], net[4])):
             layer.weight.data = sac.critics.weights[i][k].T.detach().clone()
@@ -198,7 +200,8 @@ def test_the_actor_waits_for_every_second_update_of_the_critics(s3):
 
 def test_horizon_grows_and_learning_rate_falls(s3):
     sac, _ = small_sac(s3, 1)
-    for progress, horizon, rate in ((0, 20, 1), (0.25, (20 + 1 / 0.015) / 2, 1), (0.5, 1 / 0.015, 1), (0.75, 1 / 0.015, 0.5)):
+    start, end = 1 / (1 - s3.DISCOUNT_START), 1 / (1 - s3.DISCOUNT)
+    for progress, horizon, rate in ((0, start, 1), (0.25, (start + end) / 2, 1), (0.5, end, 1), (0.75, end, 0.5)):
         assert 1 / (1 - sac.schedule(progress)) == pytest.approx(horizon)
         assert sac.critic_adam.param_groups[0]["lr"] == pytest.approx(rate * s3.LEARNING_RATE)
 
@@ -231,7 +234,7 @@ def test_sample_gives_stored_steps_of_the_recent_window(run, n):
         torch.testing.assert_close(displacement / 0.05, s2[:, 13:15], atol=2.0, rtol=0)  # metres in 0.05 s
     rows = run.replay.view(-1, 8, 66)
     s, s2, when = rows[..., :27], rows[..., 35:62], rows[..., -1]
-    goes_on = (when[1:] == when[:-1] + 1) & (s[1:] == s2[:-1]).all(2)  # a step begins where the last one of the robot ended
+    goes_on = (when[1:] == when[:-1] + 1) & (s[1:] == s2[:-1]).all(2)  # it begins where the last one ended
     assert goes_on.float().mean() > (0.5 if n > 15 else 0)
 
 
@@ -255,12 +258,13 @@ def outcome(out, experiment):
     """Policy and checkpoint without clocks and flags."""
     found = [common.load(out, kind, experiment, 0) for kind in ("policy", "policy-checkpoint")]
     found[1]["numbers"] = found[1]["numbers"][:3]  # the last is the clock
-    return [{key: value for key, value in content.items() if key not in ("seconds", "config", "sha256")} for content in found]
+    return [{key: value for key, value in content.items() if key not in ("seconds", "config", "sha256")}
+            for content in found]
 
 
 def same(one, other):
     if isinstance(one, dict):
-        return one.keys() == other.keys() and all(same(one[k], other[k]) for k in one if k not in ("minutes", "seconds"))
+        return one.keys() == other.keys() and all(same(one[k], other[k]) for k in one if k != "minutes")
     if isinstance(one, (list, tuple)):
         return len(one) == len(other) and all(map(same, one, other))
     return torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other
@@ -318,7 +322,8 @@ class Turning(nn.Module):
 
 @pytest.mark.parametrize("weight", [0.155, -0.31])
 def test_calibration_finds_the_weight_of_a_decoder_that_turns_exactly(s3, weight):
-    assert s3.calibrate_relation(Turning(weight), ["speed", "direction", "curvature"], 5) == dict(curvature=pytest.approx(weight))
+    found = s3.calibrate_relation(Turning(weight), ["speed", "direction", "curvature"], 5)
+    assert found == dict(curvature=pytest.approx(weight))
 
 
 def test_commands_are_the_decoders_first_steps():
@@ -366,6 +371,13 @@ class Fake:
 OBEY = SimpleNamespace(act=lambda s, c, deterministic: c.clone())  # an actor whose action is its command
 
 
+@pytest.fixture
+def numbers(monkeypatch):
+    """The numbers of the closed loop that the tests below count with."""
+    for name, value in dict(FEEDBACK=0.1, CORRECTION=0.2, FASTEST=0.85, SOFT_START=40).items():
+        monkeypatch.setattr(common, name, value)
+
+
 @pytest.mark.parametrize("c, reference, age, expected", [
     ((0.3, 0.0), (0.1, 0.0), 1000, (0.4, 0.0)),        # FEEDBACK 0.1 of one trajectory unit
     ((0.3, 0.0), (0.0, 5.0), 1000, (0.3, 0.2)),        # CORRECTION: at most 0.2
@@ -373,19 +385,19 @@ OBEY = SimpleNamespace(act=lambda s, c, deterministic: c.clone())  # an actor wh
     ((3.0, 4.0), (0.0, 0.0), 0, (0.12, 0.16)),         # soft start: 0.2 long
     ((3.0, 4.0), (0.0, 0.0), 20, (0.315, 0.42)),       # half of it: 0.525 long
     ((0.1, 0.0), (0.0, 0.0), 0, (0.1, 0.0))])          # shorter ones pass
-def test_closed_loop_by_hand(c, reference, age, expected):
+def test_closed_loop_by_hand(c, reference, age, expected, numbers):
     found = common.closed_loop(torch.tensor([c]), torch.tensor([reference]), Fake(age=float(age)), 0.1)
     torch.testing.assert_close(found, torch.tensor([expected]))
 
 
-def test_execute_holds_commands_open_and_closed():
+def test_execute_holds_commands_open_and_closed(numbers):
     commands = torch.tensor([[[0.5, 0.0], [0.0, 2.0]]])
     policy, robots = SimpleNamespace(actor=OBEY, scale=0.1), Fake()
     assert len(list(common.execute(policy, robots, commands, 3, False, True))) == 6
     torch.testing.assert_close(torch.cat(robots.asked), commands[0].repeat_interleave(3, 0))  # open loop: unchanged
     still = Fake(share=0.0)
     list(common.execute(policy, still, commands[:, :1], 3, True, True))
-    torch.testing.assert_close(torch.cat(still.asked)[:, 0], torch.tensor([0.5, 0.55, 0.6]))  # it falls behind by 0.5 a step
+    torch.testing.assert_close(torch.cat(still.asked)[:, 0], torch.tensor([0.5, 0.55, 0.6]))  # 0.5 behind a step
 
 
 # ---------------------------------------------------------------- measures
@@ -416,7 +428,8 @@ def test_each_row_of_experiments_from_training_to_figures(experiment, s3, fork, 
     assert float(curve[-1]["tracking_error"]) == pytest.approx(float(row["tracking_error"]), rel=1e-4)
     wedis = row["method"] == "wedis"
     assert bool(row["tracking_error_closed"]) == bool(row["fall_rate"]) == wedis and bool(row["metric"]) != wedis
-    for name in (s3.EXPERIMENTS[experiment].get("FIGURE", f"skills_{experiment}"), f"learning_curve_{experiment}", "fig14_robots"):
+    figure = s3.EXPERIMENTS[experiment].get("FIGURE", f"skills_{experiment}")
+    for name in (figure, f"learning_curve_{experiment}", "fig14_robots"):
         assert (out / f"figures/{name}.png").stat().st_size > 5_000
 
 
@@ -427,7 +440,7 @@ def test_a_row_of_ones_own_and_measuring_flags(s3, inside, out):
     assert inside(s3, *flags).returncode == 0
     policy = common.load_policy(out, "mine", 0)
     assert policy.config["TEMPERATURE"] == 0.01 and policy.config["ROBOTS"] == 4
-    more = ["--resume", "true", "--starts", 2, "--directions", 4, "--traversal", 5, "--z_range", 1, "--noisy", 1, "--figure", "x"]
+    more = "--resume true --starts 2 --directions 4 --traversal 5 --z_range 1 --noisy 1 --figure x".split()
     for extra in (more, [*more, "--train", "false"]):
         assert inside(s3, *flags, *extra).returncode == 0
     done = inside(s3, *flags, "--resume", "true", "--hidden", 24)
