@@ -243,11 +243,9 @@ def main():
     models = {key: config | changes | given for key, changes in MODELS.items()}  # flags override rows
     for key, settings in models.items():
         for name, value in settings.items():
-            if name not in config or (name in ("HIDDEN", "BATCH", "EPOCHS") and value < 1):
-                fault = "must be at least 1" if name in config else "is no constant of this file"
-                stop(f"{name} = {value} {fault} (model {key!r} of {EXPERIMENT})")
-        if settings["LEARNING_RATE"] < 0:
-            stop("--learning_rate must be 0 or more")
+            least = dict(HIDDEN=1, BATCH=1, EPOCHS=1, LEARNING_RATE=0).get(name, value)
+            if name not in config or value < least:
+                stop(f"model {key!r} of {EXPERIMENT}: {name} = {value} is no constant of 02, or less than {least}")
     if TRAIN:
         dataset = load(OUT, "dataset", DATA, DATA_SEED)
         x = torch.from_numpy(np.diff(dataset["trajectories"], axis=1))  # displacements, App. A.1.2
