@@ -245,7 +245,7 @@ def main():
         for name, value in settings.items():
             least = dict(HIDDEN=1, BATCH=1, EPOCHS=1, LEARNING_RATE=0).get(name, value)
             if name not in config or value < least:
-                stop(f"model {key!r} of {EXPERIMENT}: {name} = {value} is no constant of 02, or less than {least}")
+                stop(f"{name} = {value} (model {key!r}) is no constant of this file, or below {least}")
     if TRAIN:
         dataset = load(OUT, "dataset", DATA, DATA_SEED)
         x = torch.from_numpy(np.diff(dataset["trajectories"], axis=1))  # displacements, App. A.1.2
