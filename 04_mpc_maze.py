@@ -268,8 +268,7 @@ def dot(place, colour):
 
 def drive(u):
     """Sliders in a web page command the Ant in real time. mujoco serves the page, to this machine alone."""
-    robots, model, pages, steps = common.Robots(maze_spec(u), 1), maze_spec(u).compile(), [], 0
-    data = mujoco.MjData(model)
+    robots, data, pages, steps = common.Robots(maze_spec(u), 1), mujoco.MjData(maze_spec(u).compile()), [], 0
     z, pool, start = {"z_" + name: 0.0 for name in u.policy.names}, skill_pool(u), time.monotonic()
     hand = SimpleNamespace(mode="start again", z=z, closed=True, text="", geoms=[])  # both threads use it
     try:
@@ -281,7 +280,7 @@ def drive(u):
                 host, port = self.viewer._http_sock.getsockname()[:2]
                 if host != "127.0.0.1":
                     raise RuntimeError("it would listen beyond this machine")
-                camera, torso = self.viewer.camera, model.body("torso").id
+                camera, torso = self.viewer.camera, data.model.body("torso").id
                 camera.type, camera.distance, camera.trackbodyid = 1, 12, torso  # 1: it follows the Ant
                 print(f"drive the Ant at http://{host}:{port}/ (Ctrl-C ends it)", flush=True)
             @messages.handler
@@ -296,14 +295,13 @@ def drive(u):
                 gui.TextUnformatted(hand.text)
                 gui.End()
                 self.viewer.extra_geoms[:] = hand.geoms
-        # The trap: the viewer asks for no password and listens on every interface. Make that 127.0.0.1.
-        bind = web_viewer.web_server.bind_public_socket
+        bind = web_viewer.web_server.bind_public_socket  # the trap: on every interface, without a password
         web_viewer.web_server.bind_public_socket = lambda host, port: bind("127.0.0.1", port)
         web_viewer.print = web_viewer._print_url_banner = lambda *words, **options: None
         logging.getLogger().setLevel("CRITICAL")  # errors of the viewer are raised as well
         logging.getLogger("WebServer").addFilter(pages.append)  # who comes and goes; None hides it
         with launch_web.launch(viewer_protocol.ViewerConfig(http_port=PORT), plugins=[Panel()]) as handle:
-            handle.set_model(model, data=data)
+            handle.set_model(data.model, data=data)
             while handle.is_running() and not 0 < SECONDS <= time.monotonic() - start:
                 if pages and "(0 total)" in pages[-1].getMessage() and time.time() > pages[-1].created + 10:
                     break  # the last page is closed; one that reloads is back sooner
@@ -312,13 +310,15 @@ def drive(u):
                     robots.reset([0])
                     robots.qpos[0, :2] += u.start
                 place, mode, z = robots.place()[0], hand.mode, hand.z  # once: the page changes them
-                if mode == "plan to the goal" and math.dist(place, u.goal) < 1:
+                if asked != (mode, z):
+                    left, age = u.planned_dense, u.hold * u.length
+                if left == 0 and age == u.hold * u.length:  # the last planned skill is over
                     mode = hand.mode = "stand still"
-                if asked != (mode, z) or age == u.hold * (1 if mode == "plan to the goal" else u.length):
+                if age == u.hold * u.length:
                     asked, age, reference, going = (mode, z), 0, place, mode != "stand still"
                     skill = torch.tensor([list(z.values())])
                     if mode == "plan to the goal":
-                        skill = plan(u, "dense", u.samples[0], u.planned_dense, pool, place)[0][None]
+                        skill, left = plan(u, "dense", u.samples[0], left, pool, place)[0][None], left - 1
                     c = going * commands_of(u.policy, skill, u.length)[0].repeat_interleave(u.hold, 0)
                 command = common.closed_loop(c[age][None], reference[None], robots, u.policy.scale)
                 command = command if hand.closed else c[age][None]
