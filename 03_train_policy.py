@@ -44,7 +44,7 @@ BASE_FRAME = True        # networks read state and command in the base frame (th
 UPDATES = 100_000        # updates of the critics (the paper: 1.92 million)
 ROBOTS = 256             # robots that step together
 EPISODE = 200            # steps until a robot starts anew; not terminal: the value beyond is bootstrapped
-SKILL_STEPS = 50         # steps until the robots are given new skills
+SKILL_STEPS = 50         # steps until a robot is given a new skill
 WARM_UP = 10_000         # steps with random actions; their statistics normalise the state
 REPLAY = 1_000_000       # size of the replay buffer R, steps
 UPDATES_PER_STEP = 8     # updates in each step of all robots
@@ -199,8 +199,7 @@ def train_wedis(run, decoder):
     """Alg. 1, the second loop: train run.sac to follow the decoder's single steps."""
     m1 = run.z.shape[1]
     while run.sac.updates < UPDATES:
-        if run.new_skills():
-            run.z = torch.randn(ROBOTS, m1)  # Alg. 1: sample z_single from the prior
+        run.renew(torch.randn(ROBOTS, m1))  # Alg. 1: sample z_single from the prior
         command, _ = first_step(decoder, run.z)  # Alg. 1: z = (z_single, 0)
         run.act(command)  # Alg. 1: execute actions; the physics runs on the second core from here on
 
@@ -221,8 +220,7 @@ def train_wedis(run, decoder):
 
 
 class Run:
-    """What the three loops share: robots, replay buffer, SAC, clock, reports and checkpoints. All robots
-    change skills together, so that SKILL_STEPS steps of a robot are a trajectory of the replay buffer."""
+    """What the three loops share: robots, replay buffer, SAC, clock, reports and checkpoints."""
 
     def __init__(self, z_dim, c_dim, decoder, names, config, model=None):
         self.rng = np.random.default_rng(SEED)
@@ -236,7 +234,9 @@ class Run:
         block = ROBOTS * SKILL_STEPS
         self.replay = torch.zeros(REPLAY // block * block, sum(self.widths))
         self.z = torch.zeros(ROBOTS, z_dim)
-        self.age = self.rng.integers(0, EPISODE, ROBOTS) // SKILL_STEPS * SKILL_STEPS  # not all end at once
+        self.age = self.rng.integers(0, EPISODE, ROBOTS)  # robots start, and change skills, at other times
+        if METHOD == "sectar":
+            self.age -= self.age % SKILL_STEPS  # together: trajectories are rows of the replay buffer
         self.steps, self.unstable, self.seconds = 0, 0, 0.0
         self.curve, self.losses, self.metric = [], {}, None
         self.decoder, self.names, self.config = decoder, names, config
@@ -244,8 +244,10 @@ class Run:
         if RESUME:
             self.resume()
 
-    def new_skills(self):
-        return self.steps % SKILL_STEPS == 0
+    def renew(self, z):
+        """Take new skills z (ROBOTS, z_dim) for the robots whose SKILL_STEPS are over."""
+        over = torch.from_numpy(self.age % SKILL_STEPS == 0)
+        self.z = torch.where(over[:, None], z, self.z)
 
     def warm(self):
         """Whether the warm-up is over. At its end the statistics of the state are fixed."""
@@ -275,11 +277,8 @@ class Run:
         failed = torch.from_numpy(failed)
         self.replay[rows[failed]] = self.replay[rows[failed] - ROBOTS]  # they mean nothing: repeat the last
         self.steps += 1
-        self.age += 1
-        over = np.flatnonzero((self.age >= EPISODE) | failed.numpy())
-        if len(over):
-            self.robots.reset(over, self.rng)
-            self.age[over] = self.steps % SKILL_STEPS
+        self.age = (self.age + 1) % EPISODE
+        self.robots.reset(np.flatnonzero((self.age == 0) | failed.numpy()), self.rng)
         self.unstable += int(failed.sum())
         self.seconds += time.time() - self.clock
         updates, every = self.sac.updates, max(1, UPDATES // REPORTS)
@@ -477,8 +476,7 @@ def train_dads(run):
 
     run.metric = metric
     while run.sac.updates < UPDATES:
-        if run.new_skills():
-            run.z = torch.rand(ROBOTS, Z_DIM) * 2 - 1
+        run.renew(torch.rand(ROBOTS, Z_DIM) * 2 - 1)
         run.act(run.z)
         if run.warm():
             # from recent steps and their own skills: from relabelled ones q learns that z means nothing
@@ -551,11 +549,11 @@ def train_sectar(run):
 
     run.metric = metric
     while run.sac.updates < UPDATES:
-        if run.new_skills():
-            run.z = torch.randn(ROBOTS, Z_DIM)
-            explorers = torch.rand(ROBOTS) < EXPLORE
-            run.z[explorers, :2] = EXPLORER * nn.functional.normalize(run.z[explorers, :2])
-            run.z[explorers, -1] = EXPLORER
+        z = torch.randn(ROBOTS, Z_DIM)
+        explorers = torch.rand(ROBOTS) < EXPLORE
+        z[explorers, :2] = EXPLORER * nn.functional.normalize(z[explorers, :2])
+        z[explorers, -1] = EXPLORER
+        run.renew(z)
         with torch.no_grad():
             commands = steps_of(run.z, decoder(run.z, SKILL_STEPS)[0])
         run.act(commands[:, run.steps % SKILL_STEPS])
