@@ -2,8 +2,7 @@
 
 Reads runs/wetvae_*.pt of stage 2. A skill z_single asks for a step: the decoder's first displacement, here
 called the command c. The reward is the decoder's log-likelihood of the step that the robot makes (Eq. 6).
-Writes runs/policy_<experiment>_seed<seed>.pt, Fig 5, 14 (15, 16), the learning curve and a row of
-runs/results/policies.csv.
+Writes runs/policy_<experiment>_seed<seed>.pt, Fig 5, 14 (15, 16) and a row of runs/results/policies.csv.
 Takes 21 minutes on two cores that were busy with other work, 100,000 updates. Expect, n = 1 (seed 0):
 tracking error 0.15 in open loop, 0.18 in closed loop; there 0.3 m off after a skill of 200 steps (median).
 """
@@ -11,14 +10,13 @@ import copy
 import math
 import time
 from concurrent.futures import ThreadPoolExecutor
-from itertools import permutations
 from pathlib import Path
 from types import SimpleNamespace
 
 import common  # before mujoco: it chooses how mujoco renders
-from common import (MULTI, SINGLE, Actor, Decoder, Robots, SkillDynamics, ant_spec, artifact_name, check_same,
+from common import (MULTI, SINGLE, Actor, Decoder, Robots, SkillDynamics, artifact_name, check_same,
                     commands_of, cross_talk, execute, factors_of, first_step, layers, load, load_policy, pack,
-                    parse_flags, plt, purity, read_csv, save, save_figure, stop, unpack, update_csv)
+                    parse_flags, plt, purity, robot_spec, save, save_figure, stop, unpack, update_csv)
 import mujoco
 import numpy as np
 import torch
@@ -41,7 +39,7 @@ STEP_SCALE = 0.1         # metres per trajectory unit, App. A.1.3: 1/10, Half-Ch
 VARIANCE_SCALE = 0.05    # decoder variance -> square metres, App. A.1.3: 1/20
 BASE_FRAME = True        # networks read state and command in the base frame (the paper: in the world's)
 
-UPDATES = 100_000        # updates of the critics (the paper: 1.92 million)
+UPDATES = 130_000        # updates of the critics (the paper: 1.92 million)
 ROBOTS = 256             # robots that step together
 EPISODE = 200            # steps until a robot starts anew; not terminal: the value beyond is bootstrapped
 SKILL_STEPS = 50         # steps until a robot is given a new skill
@@ -56,8 +54,7 @@ LEARNING_RATE = 1e-3     # Adam (the paper: 3e-4, fixed)
 DECAY_FROM = 0.5         # share of the updates after which the learning rate falls linearly to 0
 ACTOR_EVERY = 2          # actor and value network learn in each second update of the critics (the paper: 1)
 AVERAGED = 0.002         # rate of the running average of the actor's weights: the policy (the paper: 1)
-DISCOUNT_START = 0.95    # gamma of Eq. 1 at the start: a short horizon teaches tracking sooner
-DISCOUNT = 0.985         # and from the middle on: a long one teaches not to fall (the paper: 0.99)
+DISCOUNT = 0.97          # gamma of Eq. 1 (the paper: 0.99): a shorter horizon teaches to follow sooner
 SMOOTHING = 0.01         # of the target value network, App. A.1.3
 REWARD_SCALE = 0.1       # of Eq. 6 (the paper: 1)
 TEMPERATURE = 0.003      # alpha, weight of the entropy (the paper: 0.01, which is 0.001 at our reward scale)
@@ -88,7 +85,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
     "ant_semi": dict(FIGURE="fig05_skills_wedis"),
     "ant_full": dict(DECODER="full_circle", DIRECTIONS=16, FIGURE="fig15_full_circle"),
     "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, BASE_FRAME=False,
-                         Z_RANGE=1.0, UPDATES=60_000, MULTI_RUN=(6, 20), FIGURE="fig16_half_cheetah"),
+                         Z_RANGE=1.0, MULTI_RUN=(6, 20), FIGURE="fig16_half_cheetah"),
     "ant_world_frame": dict(BASE_FRAME=False),  # the paper's networks: what the base frame is good for
     "ant_dads": dict(METHOD="dads", Z_RANGE=1.0, SKILL_STEPS=200, FIGURE="fig05_skills_dads"),
     "ant_sectar": SECTAR | dict(FIGURE="fig05_skills_sectar"),
@@ -148,18 +145,16 @@ class Sac:
         self.average.load_state_dict(self.actor.state_dict())
 
     def schedule(self, progress):
-        """Set the learning rate for a share of training that is done (0 to 1). Returns the discount."""
+        """Set the learning rate for a share of training that is done (0 to 1)."""
         rate = LEARNING_RATE * min(1, (1 - progress) / max(1 - DECAY_FROM, 1e-9))
         for group in self.critic_adam.param_groups + self.actor_adam.param_groups:
             group["lr"] = rate
-        start, end = 1 / (1 - DISCOUNT_START), 1 / (1 - DISCOUNT)  # horizons, steps
-        return 1 - 1 / (start + (end - start) * min(1, 2 * progress))
 
-    def update(self, x, a, x2, r, discount):
+    def update(self, x, a, x2, r):
         """One update. x, x2 (B, n): Actor.inputs before and after the step; a (B, m); r (B,). No step is
         terminal (a time limit is none). Returns a number that is not finite if a loss is not."""
         with torch.no_grad():
-            q_target = r + discount * self.target(x2).squeeze(1)
+            q_target = r + DISCOUNT * self.target(x2).squeeze(1)
         q_loss = 0.5 * ((self.critics(x, a) - q_target) ** 2).mean(1).sum()
         self.critic_adam.zero_grad()
         q_loss.backward()
@@ -205,7 +200,7 @@ def train_wedis(run, decoder):
 
         if run.warm():
             progress = run.sac.updates / UPDATES
-            discount = run.sac.schedule(progress)
+            run.sac.schedule(progress)
             floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** min(1, max(0, (progress - 0.15) / 0.45))
             s, a, s2, displacement, z = run.sample(UPDATES_PER_STEP * BATCH)  # Alg. 1: sample a batch
             fresh = torch.rand(len(z), 1) < RELABELLED
@@ -214,7 +209,7 @@ def train_wedis(run, decoder):
             r = reward(command, log_var, displacement, floor)  # Alg. 1: compute the reward, Eq. 6
             x, x2 = run.sac.actor.inputs(s, command), run.sac.actor.inputs(s2, command)
             for batch in zip(*(v.split(BATCH) for v in (x, a, x2, r))):
-                loss = run.sac.update(*batch, discount)  # Alg. 1: optimize psi and the critics
+                loss = run.sac.update(*batch)  # Alg. 1: optimize psi and the critics
             run.losses = dict(reward=r.mean().item(), loss=loss)
         run.collect()  # Alg. 1: the samples go to the replay buffer R
 
@@ -311,8 +306,7 @@ class Run:
         row |= self.losses
         self.curve.append(row)
         left = self.seconds / 60 * (UPDATES / self.sac.updates - 1)
-        text = [f"{name} {value:.3f}" if isinstance(value, float) else f"{name} {value}"
-                for name, value in row.items()]
+        text = [f"{name} {value:.5g}" for name, value in row.items()]
         speed = self.sac.updates / self.seconds
         print(*text, f"{speed:.0f} updates/s", f"{left:.1f} min left", sep="  ", flush=True)
 
@@ -406,7 +400,6 @@ def main():
              f"{policy.robot} --step_scale {policy.scale}; give the same, or train anew")
     measure(policy, source["ranges"])
     draw_skills(policy)
-    draw_learning_curve(policy.curve)
     draw_robots()
 
 
@@ -426,15 +419,16 @@ def check_constants(decoder, names):
              "choose another --decoder or --robot")
     if BASE_FRAME and ROBOT != "ant":
         stop("only a robot in the plane has a base frame: --base_frame false")
-    for name in ("UPDATES ROBOTS EPISODE SKILL_STEPS WARM_UP BATCH UPDATES_PER_STEP HIDDEN THREADS REPORTS "
-                 "Z_DIM ACTOR_EVERY RECENT MODEL_BATCH PRIOR_SAMPLES DIRECTIONS NOISY STARTS STEP_SCALE "
-                 "FLOOR_START FLOOR_END VARIANCE_SCALE LEARNING_RATE Z_RANGE SINGLE_RUN MULTI_RUN").split():
-        if np.min(globals()[name]) <= 0:
+    for name in ("UPDATES ROBOTS EPISODE SKILL_STEPS WARM_UP REPLAY BATCH UPDATES_PER_STEP HIDDEN ACTOR_EVERY "
+                 "THREADS REPORTS Z_DIM RECENT MODEL_BATCH PRIOR_SAMPLES DIRECTIONS TRAVERSAL NOISY STARTS "
+                 "SINGLE_RUN MULTI_RUN").split():
+        if any(value < 1 or value % 1 for value in np.atleast_1d(globals()[name])):
+            stop(f"--{name.lower()} must be whole and above 0")
+    for name in "STEP_SCALE VARIANCE_SCALE LEARNING_RATE FLOOR_START FLOOR_END Z_RANGE".split():
+        if globals()[name] <= 0:
             stop(f"--{name.lower()} must be above 0")
-    if TRAVERSAL < 2 or any(value % 1 for value in SINGLE_RUN + MULTI_RUN):
-        stop("--traversal is at least 2; --single_run and --multi_run are two whole numbers each")
-    if not DISCOUNT_START <= DISCOUNT < 1 or max(RELABELLED, EXPLORE, AVERAGED, SMOOTHING, DECAY_FROM) > 1:
-        stop("--discount is at least --discount_start and below 1; shares and rates are at most 1")
+    if DISCOUNT >= 1 or max(RELABELLED, EXPLORE, AVERAGED, SMOOTHING, DECAY_FROM) > 1:
+        stop("--discount is below 1; shares and rates are at most 1")
     block = ROBOTS * SKILL_STEPS
     if EPISODE % SKILL_STEPS or REPLAY < max(WARM_UP, 2 * block) or METHOD == "sectar" and WARM_UP < block:
         stop(f"--skill_steps must divide --episode; --replay is at least --warm_up and {2 * block} (two "
@@ -488,14 +482,14 @@ def train_dads(run):
             loss.backward()
             run.adam.step()
 
-            discount = run.sac.schedule(run.sac.updates / UPDATES)
+            run.sac.schedule(run.sac.updates / UPDATES)
             s, a, s2, displacement, z = run.sample(UPDATES_PER_STEP * BATCH)
             fresh = torch.rand(len(z), 1) < RELABELLED
             z = torch.where(fresh, torch.rand(z.shape) * 2 - 1, z)
             r = REWARD_SCALE * information(displacement, z)
             x, x2 = run.sac.actor.inputs(s, z), run.sac.actor.inputs(s2, z)
             for batch in zip(*(v.split(BATCH) for v in (x, a, x2, r))):
-                run.sac.update(*batch, discount)
+                run.sac.update(*batch)
             run.losses = dict(reward=r.mean().item(), loss=loss.item())
         run.collect()
 
@@ -566,7 +560,7 @@ def train_sectar(run):
             loss.backward()
             run.adam.step()
 
-            discount = run.sac.schedule(run.sac.updates / UPDATES)
+            run.sac.schedule(run.sac.updates / UPDATES)
             share = min(16, SKILL_STEPS)  # steps of each trajectory in the batch: decoded once
             rows = trajectories(max(1, UPDATES_PER_STEP * BATCH // share), len(run.replay))
             t = torch.randint(SKILL_STEPS, (len(rows), share))
@@ -590,7 +584,7 @@ def train_sectar(run):
                 x, x2 = run.sac.actor.inputs(s, c), run.sac.actor.inputs(s2, c2)
             order = torch.randperm(len(x))
             for batch in zip(*(v[order].split(BATCH) for v in (x, a, x2, r))):
-                run.sac.update(*batch, discount)
+                run.sac.update(*batch)
             run.losses = dict(reward=r.mean().item(), loss=loss.item())
         run.collect()
 
@@ -598,7 +592,7 @@ def train_sectar(run):
 # ================================================================ Measuring and drawing: not needed for WEDIS
 
 def make_robots(n, threads):
-    return Robots(ant_spec() if ROBOT == "ant" else half_cheetah_spec(), n, threads)
+    return Robots(robot_spec(ROBOT), n, threads)
 
 
 def traversal(policy, axis, values):
@@ -613,14 +607,14 @@ def traversal(policy, axis, values):
 def grid(policy):
     """Skills of the tracking error, z_multi = 0: 5 speeds x DIRECTIONS (on a rail 8 speeds), DADS 5 x 5,
     SeCTAR 25 fixed draws from the prior."""
-    ends = torch.linspace(-Z_RANGE, Z_RANGE, 5)
     if METHOD == "sectar":
         return torch.randn(25, Z_DIM, generator=torch.Generator().manual_seed(0))
-    if METHOD == "wedis" and "direction" not in policy.names:
-        z = torch.linspace(-Z_RANGE, Z_RANGE, 9)[torch.arange(9) != 4][:, None]
+    if policy.decoder.x_dim == 1:
+        z = torch.linspace(-Z_RANGE, Z_RANGE, 8)[:, None]
     else:
         circle = METHOD == "wedis" and policy.decoder.circle is not None  # its two ends are one direction
-        z = torch.cartesian_prod(ends, torch.linspace(-Z_RANGE, Z_RANGE, DIRECTIONS + circle)[:DIRECTIONS])
+        directions = torch.linspace(-Z_RANGE, Z_RANGE, DIRECTIONS + circle)[:DIRECTIONS]
+        z = torch.cartesian_prod(torch.linspace(-Z_RANGE, Z_RANGE, 5), directions)
     return nn.functional.pad(z, (0, (len(policy.names) or Z_DIM) - z.shape[1]))
 
 
@@ -656,8 +650,7 @@ def tracking(policy, closed):
 
 def following(policy, closed):
     """Following error: three random skills one after another from noisy starts. Returns median and 90 %
-    quantile of |executed - predicted end| of a skill in metres, and the share of robots that ever turn
-    over."""
+    quantile of |executed - predicted end| of a skill, metres, and the share of robots that ever turn over."""
     rng = np.random.default_rng(SEED)
     robots = make_robots(STARTS, THREADS)
     robots.reset(np.arange(STARTS), rng)
@@ -671,14 +664,15 @@ def following(policy, closed):
         for _ in execute(policy, robots, commands, int(MULTI_RUN[1]), closed, True):
             fallen |= robots.upside_down()
         away.append((robots.place() - predicted).norm(dim=1).numpy())
-    return float(np.median(away)), float(np.quantile(away, 0.9)), float(fallen.mean())
+    return dict(follow_median_m=float(np.median(away)), follow_p90_m=float(np.quantile(away, 0.9)),
+                fall_rate=float(fallen.mean()))
 
 
 def executed_cross_talk(policy, ranges, closed):
     """Cross-talk C (axes, factors) of executed skills, the mean over noisy starts, per fifth of a skill."""
     values, curves = np.linspace(-Z_RANGE, Z_RANGE, TRAVERSAL), []
     every = max(1, int(MULTI_RUN[0] * MULTI_RUN[1]) // 5)
-    for axis in range(len(policy.names) or Z_DIM):
+    for axis in range(len(policy.names)):
         z = traversal(policy, axis, values).repeat(NOISY, 1)
         places = roll_out(policy, z, MULTI_RUN, closed, noise=SEED + 1, run_in=int(MULTI_RUN[1]))[:, ::every]
         steps = np.diff(places, axis=1).reshape(NOISY, TRAVERSAL, places.shape[1] - 1, -1).mean(0)
@@ -686,35 +680,20 @@ def executed_cross_talk(policy, ranges, closed):
     return cross_talk(curves, ranges)
 
 
-def match(C):
-    """Which axis is which factor, by the largest sum of purities (the axes of baselines have no names).
-    Returns {factor: axis}, one-to-one, by number; with fewer axes than factors some factors are missing."""
-    share = C / np.maximum(C.sum(1, keepdims=True), 1e-9)
-    axes = list(range(len(C))) + [None] * C.shape[1]
-    picks = permutations(axes, C.shape[1])
-    choices = [{j: i for j, i in enumerate(pick) if i is not None} for pick in picks]
-    return max(choices, key=lambda pick: sum(share[i, j] for j, i in pick.items()))
-
-
 def measure(policy, ranges):
     """Print and write one row of results/policies.csv. _open: open loop, as in the paper."""
     row = dict(experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy.updates,
                env_steps=policy.env_steps, train_minutes=policy.seconds / 60,
-               tracking_error=tracking(policy, False),
-               tracking_error_closed=tracking(policy, True) if policy.names else "")
-    follow = ("follow_median_m", "follow_p90_m", "fall_rate")
-    for closed, end in ((False, "_open"), (True, "")):
-        row |= {name + end: "" for name in (*follow, *(f"purity_{name}" for name in SINGLE + MULTI))}
-        if policy.names:
-            row |= {name + end: value for name, value in zip(follow, following(policy, closed))}
-        if policy.names or not closed:  # the commands of DADS are no places: open loop alone
+               tracking_error=tracking(policy, False))
+    if METHOD == "wedis":
+        row["tracking_error_closed"] = tracking(policy, True)
+        for closed, end in ((False, "_open"), (True, "")):
+            row |= {name + end: value for name, value in following(policy, closed).items()}
             C = executed_cross_talk(policy, ranges, closed)
-            axes = {j: j for j in range(len(ranges))} if policy.names else match(C)
-            for j, i in axes.items():
-                row[f"purity_{list(ranges)[j]}{end}"] = purity(C, i, j)
-    row["metric"] = policy.curve[-1].get("metric", "") if policy.curve else ""
-    for name, value in row.items():
-        print(f"{name:24s} {value:.3f}" if isinstance(value, float) else f"{name:24s} {value}")
+            row |= {f"purity_{name}{end}": purity(C, i, i) for i, name in enumerate(policy.names)}
+    else:
+        row["metric"] = policy.curve[-1]["metric"]
+    print(*(f"{name:24} {value}" for name, value in row.items()), sep="\n")
     update_csv(Path(OUT) / "results" / "policies.csv", [row], ("experiment", "seed"))
 
 
@@ -738,13 +717,13 @@ def draw_skills(policy):
         z = traversal(policy, i, values)
         paths = [predicted_path(policy, z, run)]
         paths += [roll_out(policy, z, run, closed) for closed in (False, True)[:len(rows) - 1]]
-        low = np.min([path.min((0, 1)) for path in paths], 0)
-        high = np.max([path.max((0, 1)) for path in paths], 0)
+        places = np.concatenate([path.reshape(-1, path.shape[2]) for path in paths])
+        low, high = places.min(0), places.max(0)
         reach = 0.6 * (high - low).max() + 0.01  # one scale for all rows of a column
         limits = [(middle - reach, middle + reach) for middle in (low + high) / 2]
         for ax, path in zip(axes[:, i], paths):
-            marks = path[:, ::1 if path is paths[0] else int(run[1])]
             ax.set_xlim(limits[0])
+            marks = path[:, ::1 if path is paths[0] else int(run[1])]
             if rail:
                 for t, colour in enumerate(plt.get_cmap("plasma")(np.linspace(0, 0.85, marks.shape[1]))):
                     ax.plot(marks[:, t, 0], values, ".", color=colour, label=f"t = {t}")
@@ -764,52 +743,25 @@ def draw_skills(policy):
     save_figure(figure, OUT, FIGURE or f"skills_{EXPERIMENT}")
 
 
-def draw_learning_curve(curve):
-    """Tracking error and, of a baseline, its own measure against the minutes of training; a line per seed."""
-    if not curve:
-        return
-    folder, name = Path(OUT) / "results", f"learning_curve_{EXPERIMENT}"
-    update_csv(folder / f"{name}_seed{SEED}.csv", curve, ())
-    curves = [read_csv(path) for path in sorted(folder.glob(f"{name}_seed*.csv"))]
-    labels = {"tracking_error": "tracking error, open loop",
-              "tracking_error_closed": "tracking error, closed loop",
-              "metric": "mutual information (nats)" if METHOD == "dads" else "reconstruction error"}
-    shown = [column for column in labels if column in curve[-1]]
-    figure, axes = plt.subplots(1, len(shown), figsize=(4 * len(shown), 2.8), squeeze=False)
-    for ax, column in zip(axes[0], shown):
-        for rows in curves:
-            points = np.array([(row["minutes"], row[column]) for row in rows], float)
-            ax.plot(*points.T, lw=1.2, color=common.BLUE)
-        ax.set(xlabel=f"minutes of training, {len(curves)} seed(s)", ylabel=labels[column])
-        if "error" in labels[column]:
-            ax.set_ylim(0, 1.1)
-    save_figure(figure, OUT, name)
-
-
 def draw_robots():
     """Fig 14: both robots, rendered by MuJoCo off-screen."""
     figure, axes = plt.subplots(1, 2, figsize=(8, 3.2))
-    for ax, title, spec in zip(axes, ("Ant", "Half-Cheetah"), (ant_spec(), half_cheetah_spec())):
-        model = spec.compile()
-        data, camera = mujoco.MjData(model), mujoco.MjvCamera()
-        data.qpos[:] = model.key_qpos[0] if model.nkey else model.qpos0
+    for ax, name in zip(axes, ("ant", "half_cheetah")):
+        model = robot_spec(name).compile()
+        model.stat.extent = 2.2  # metres, what the default camera shows
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
         mujoco.mj_forward(model, data)
-        camera.lookat, camera.distance, camera.azimuth, camera.elevation = (0, 0, 0.5), 3, 120, -20
         try:
             renderer = mujoco.Renderer(model, 400, 500)
         except Exception:  # no GL library, no device: the kinds differ by platform
             print("no Fig 14: MuJoCo's renderer needs a GL library, such as libegl1 (Debian, Ubuntu)")
             return plt.close(figure)
-        renderer.update_scene(data, camera)
+        renderer.update_scene(data)
         ax.imshow(renderer.render())
-        ax.set(title=title, xticks=[], yticks=[])
+        ax.set(title=name, xticks=[], yticks=[])
         ax.grid(False)
     save_figure(figure, OUT, "fig14_robots")
-
-
-def half_cheetah_spec():
-    """The Half-Cheetah of the MuJoCo benchmarks. nq 9, nv 9, nu 6."""
-    return mujoco.MjSpec.from_file(str(common.HERE / "half_cheetah.xml"))
 
 
 if __name__ == "__main__":

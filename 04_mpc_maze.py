@@ -227,7 +227,7 @@ def main():
 
 def maze_spec(u):
     """The Ant between real walls 1 m high, a sensor of their contacts, and the goal as a red disc."""
-    spec = common.ant_spec()
+    spec = common.robot_spec("ant")
     maze = spec.worldbody.add_body(name="maze")
     for x0, x1, y0, y1 in u.walls:
         maze.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=[(x0 + x1) / 2, (y0 + y1) / 2, 0.5], conaffinity=1,
@@ -364,7 +364,7 @@ def settings(method, maze, config, given):
     for name, value in rows.items():
         if name not in config or name in OF_A_RUN:
             stop(f"{name} {of} is no constant that it may set")
-        rows[name] = common.convert(value, config[name], True, f"{name} {of}")
+        rows[name] = common.convert(value, config[name], f"{name} {of}")
     values = {name.lower(): value for name, value in (config | rows | given).items() if name not in OF_A_RUN}
     u = SimpleNamespace(**values | dict(method=method, maze=maze, walls=walls))
     for name, allowed in dict(samples=1, look_ahead=1, policy_seeds=0, modes=MODE_WORDS,

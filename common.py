@@ -5,7 +5,6 @@ Units: trajectory units for decoder displacements (one transition is at most 1),
 world, `scale` metres per trajectory unit and environment step, 0.05 s per environment step.
 """
 import argparse
-import ast
 import contextlib
 import csv
 import ctypes.util
@@ -14,6 +13,7 @@ import io
 import json
 import math
 import os
+import re
 import signal
 import sys
 from pathlib import Path
@@ -44,25 +44,26 @@ def stop(message, code=2):
     raise SystemExit(code)
 
 
-def convert(value, like, negative, name):
+def convert(value, like, name):
     """value (a flag's text, or an entry of a row) -> the type of `like`. Exits with 2 if it does not fit."""
-    size = np.size(like)
+    text = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    if isinstance(like, str):
+        return text
+    if isinstance(like, bool):
+        if text.lower() not in ("true", "false"):
+            stop(f"{name} is {text!r}, but must be true or false")
+        return text.lower() == "true"
     try:
-        if isinstance(like, bool):
-            return {"true": True, "false": False}[str(value).lower()]
-        if isinstance(like, str):
-            return str(value)
-        parts = value.split() if isinstance(value, str) else np.atleast_1d(value)
-        numbers = [float(part) for part in parts]
-        fits = len(numbers) == size and all(map(math.isfinite, numbers))
-        whole = not isinstance(like, int) or numbers[0].is_integer()
-        if fits and whole and (negative or min(numbers) >= 0):
-            return tuple(numbers) if isinstance(like, tuple) else type(like)(numbers[0])
-    except (KeyError, TypeError, ValueError):
-        pass
-    kinds = {bool: "true or false", int: "a whole number", float: "a number", tuple: f"{size} numbers"}
-    limit = "" if negative or isinstance(like, bool) else ", 0 or more"
-    stop(f"{name} is {value!r}, but must be {kinds[type(like)]}{limit}")
+        numbers = [float(part) for part in text.split()]
+    except ValueError:
+        numbers = []
+    fits = len(numbers) == np.size(like) and all(map(math.isfinite, numbers))
+    if fits and isinstance(like, tuple):
+        return tuple(numbers)
+    if fits and (isinstance(like, float) or numbers[0].is_integer()):
+        return type(like)(numbers[0])
+    kinds = {int: "a whole number", float: "a number", tuple: f"{np.size(like)} numbers"}
+    stop(f"{name} is {text!r}, but must be {kinds[type(like)]}")
 
 
 def parse_flags(stage, argv=None):
@@ -73,40 +74,37 @@ def parse_flags(stage, argv=None):
     if hasattr(signal, "SIGPIPE"):
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # piped into head: end as other programs do
     sys.excepthook = one_line_when_stopped
-    source = Path(stage["__file__"]).read_text(encoding="utf-8")
     parser = argparse.ArgumentParser(description=stage["__doc__"], allow_abbrev=False,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.error = lambda message: stop(f"{message}; see --help")
-    rows, negative = stage["EXPERIMENTS"], {}
-    for node in ast.parse(source).body:
-        name = getattr(node.targets[0], "id", "") if isinstance(node, ast.Assign) else ""
-        if not name.isupper() or not isinstance(stage[name], (bool, int, float, str, tuple)):
+    names, source = [], Path(stage["__file__"]).read_text(encoding="utf-8")
+    for name, text, comment in re.findall(r"^([A-Z_]+) = (.*?)(?:  +# (.*))?$", source, re.MULTILINE):
+        if not isinstance(stage[name], (bool, int, float, str, tuple)):
             continue
-        text, _, comment = source.splitlines()[node.end_lineno - 1].partition("  # ")
         if isinstance(stage[name], float) and stage[name].is_integer() and "." not in text:
             stage[name] = int(stage[name])  # 1e4 means ten thousand
-        values = [stage[name]] + [row.get(name) for row in rows.values()]
-        negative[name] = any(isinstance(v, tuple) or isinstance(v, (int, float)) and v < 0 for v in values)
+        names.append(name)
         parser.add_argument("--" + name.lower(), dest=name, metavar=type(stage[name]).__name__,
                             help=f"{comment} [{stage[name]}]".replace("%", "%%"))
     parsed, unknown = parser.parse_known_args(argv)
     if unknown:
-        stop(f"unknown flag {unknown[0]}; allowed: {' '.join('--' + name.lower() for name in negative)}")
-    given = {name: convert(value, stage[name], negative[name], "--" + name.lower())
+        stop(f"unknown flag {unknown[0]}; allowed: {' '.join('--' + name.lower() for name in names)}")
+    given = {name: convert(value, stage[name], "--" + name.lower())
              for name, value in vars(parsed).items() if value is not None}
-    experiment = given.get("EXPERIMENT", stage["EXPERIMENT"])
+    experiment, rows = given.get("EXPERIMENT", stage["EXPERIMENT"]), stage["EXPERIMENTS"]
     if experiment not in rows:
         stop(f"unknown experiment {experiment!r}; allowed: {' '.join(rows)}")
     for name, value in rows[experiment].items():
-        if name not in stage:
-            stop(f"the row {experiment!r} of EXPERIMENTS names {name}, which is no constant of this file")
         where = f"{name} in the row {experiment!r} of EXPERIMENTS"
-        stage[name] = convert(value, stage[name], negative[name], where) if name in negative else value
+        if name not in stage:
+            stop(f"{where} is no constant of this file")
+        stage[name] = convert(value, stage[name], where) if name in names else value
     stage.update(given)
-    if stage["SEED"] < 0:
-        stop("--seed must be 0 or more")
+    for name in names:
+        if isinstance(stage[name], (int, float)) and stage[name] < 0:
+            stop(f"--{name.lower()} must be 0 or more")
     write_whole(Path(stage["OUT"]) / f".can_write_{os.getpid()}", b"").unlink()  # before any work is lost
-    return {name: stage[name] for name in negative}, given
+    return {name: stage[name] for name in names}, given
 
 
 def one_line_when_stopped(kind, error, trace):
@@ -153,7 +151,7 @@ def save(out, kind, experiment, seed, config, **content):
     return write_whole(path, data + hashlib.sha256(data).digest())
 
 
-def load(out, kind, experiment, seed, quiet=False):
+def load(out, kind, experiment, seed):
     """Read an artifact from <out>/, else pretrained/, and say which. Returns its content and "sha256" (hex
     digits). Exits with 2 and one line if it is missing, damaged, foreign or not finite."""
     name = artifact_name(kind, experiment, seed)
@@ -161,28 +159,22 @@ def load(out, kind, experiment, seed, quiet=False):
     paths = [path for path in (Path(out) / name, HERE / "pretrained" / name) if path.exists()]
     if not paths:
         stop(f"no {name} in {out}/ or pretrained/; {make}")
-    path = paths[0]
-    try:
-        data = path.read_bytes()
-        if hashlib.sha256(data[:-32]).digest() != data[-32:]:
-            raise ValueError
-        if kind == "dataset":
-            with np.load(io.BytesIO(data), allow_pickle=False) as file:
-                content = {key: file[key] for key in file.files}
-            content |= json.loads(str(content.pop("meta")))
-        else:
-            content = torch.load(io.BytesIO(data[:-32]), weights_only=True)
-    except Exception:  # numpy, zipfile and torch raise a dozen kinds on a damaged file; all mean the same
+    path, data = paths[0], paths[0].read_bytes()
+    if hashlib.sha256(data[:-32]).digest() != data[-32:]:
         stop(f"{path} is damaged or is no artifact of this project; {make}")
+    if kind == "dataset":
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            content = {key: file[key] for key in file.files}
+        content |= json.loads(str(content.pop("meta")))
+    else:
+        content = torch.load(io.BytesIO(data[:-32]), weights_only=True)
     for key, needed in dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed).items():
         if content[key] != needed:
             stop(f"{path} has {key} {content[key]!r} where {needed!r} is needed; {make}")
-    kinds = (float, np.ndarray, torch.Tensor)
-    leaves = [np.asarray(leaf) for leaf in tree_leaves(content) if isinstance(leaf, kinds)]
-    if not all(np.isfinite(leaf).all() for leaf in leaves if leaf.dtype.kind == "f"):  # not for text
+    numbers = [np.asarray(leaf) for leaf in tree_leaves(content) if not isinstance(leaf, str)]
+    if not all(np.isfinite(leaf).all() for leaf in numbers if leaf.dtype.kind == "f"):
         stop(f"{path} holds numbers that are not finite; {make}")
-    if not quiet:
-        print(f"using {path.relative_to(HERE) if path.is_relative_to(HERE) else path}")
+    print(f"using {path.relative_to(HERE) if path.is_relative_to(HERE) else path}")
     return content | dict(sha256=data[-32:].hex())
 
 
@@ -193,8 +185,6 @@ def check_same(artifact, config, free):
         if made.get(name) != config[name]:
             stop(f"{artifact['kind']} {artifact['experiment']} was made with {name} = {made.get(name)}, not "
                  f"{config[name]}: give the same, or train anew")
-
-
 
 
 def update_csv(path, rows, key):
@@ -209,7 +199,8 @@ def update_csv(path, rows, key):
         old = read_csv(path) if path.exists() else []
         kept = [row for row in old if tuple(row.get(k) for k in key) not in replaced]
         text = io.StringIO()
-        writer = csv.DictWriter(text, list(new[0]), extrasaction="ignore", restval="", lineterminator="\n")
+        columns = list(dict.fromkeys(name for row in kept + new for name in row))
+        writer = csv.DictWriter(text, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(kept + new)
         write_whole(path, text.getvalue().encode())
@@ -408,9 +399,9 @@ def commands_of(policy, z, steps):
 FRAME_SKIP = 5  # physics steps of 0.01 s per environment step
 
 
-def ant_spec():
-    """The Ant of the MuJoCo benchmarks: nq 15, nv 14, nu 8. A spec can still be changed: 04 adds walls."""
-    return mujoco.MjSpec.from_file(str(HERE / "ant.xml"))
+def robot_spec(name):
+    """ant (nq 15, nv 14, nu 8) or half_cheetah (9, 9, 6) of the MuJoCo benchmarks. 04 adds walls to it."""
+    return mujoco.MjSpec.from_file(str(HERE / f"{name}.xml"))
 
 
 class Robots:
@@ -421,7 +412,7 @@ class Robots:
         model = spec.compile()
         self.batch = Batch(model, n, threads)
         self.places = 2 if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE else 1
-        self.rest = model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
+        self.rest = model.key_qpos[0].copy()
         views = map(self.batch.bind, ("qpos", "qvel", "ctrl", "time"))  # of MuJoCo's own arrays
         self.qpos, self.qvel, self.ctrl, self.time = views
         self.reset(np.arange(n))
@@ -546,10 +537,10 @@ def execute(policy, robots, commands, hold, closed, deterministic):
                 reference = reference + policy.scale * c
 
 
-def load_policy(out, experiment, seed, quiet=False):
+def load_policy(out, experiment, seed):
     """A policy artifact of 03 as a namespace: networks actor and decoder, method, robot, names of the axes
     ([] for DADS, SeCTAR), relation (weights), scale (metres per trajectory unit), and what else it holds."""
-    content = load(out, "policy", experiment, seed, quiet)
+    content = load(out, "policy", experiment, seed)
     networks = {name: unpack(content[name]) for name in ("actor", "decoder")}
     return SimpleNamespace(**content | networks)
 

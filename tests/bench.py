@@ -53,7 +53,7 @@ def sb3_updates():
 
 
 def our_robots(threads):
-    robots, action = common.Robots(common.ant_spec(), 64, threads), np.random.uniform(-1, 1, (64, 8))
+    robots, action = common.Robots(common.robot_spec("ant"), 64, threads), np.random.uniform(-1, 1, (64, 8))
 
     def step():
         robots.observe()
@@ -62,7 +62,7 @@ def our_robots(threads):
 
 
 def bare_mj_step():
-    model = common.ant_spec().compile()
+    model = common.robot_spec("ant").compile()
     data = mujoco.MjData(model)
     action = np.random.uniform(-1, 1, 8)
 

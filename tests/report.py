@@ -45,9 +45,7 @@ def ship(runs):
     """Copy what a runs/ folder holds into the shipped folders; never checkpoints, data sets or unmeasured policies."""
     for path in sorted((runs / "results").glob("*.csv")):
         rows = common.read_csv(path)
-        if path.stem.startswith("learning_curve_"):
-            copy(path, ROOT / "results")
-        elif path.stem in KEYS and rows:
+        if path.stem in KEYS and rows:
             common.update_csv(ROOT / "results" / path.name, rows, KEYS[path.stem])
             (ROOT / "results" / f"{path.name}.lock").unlink(missing_ok=True)
             print(f"merged {len(rows)} rows into results/{path.name}")
@@ -64,6 +62,32 @@ def ship(runs):
             copy(path, ROOT / "pretrained")
         else:
             print(f"left out {path.name}: it has no row in policies.csv")
+
+
+def learning_curves():
+    """results/learning_curves.csv and figures/learning_curves.png, from what the shipped policies hold."""
+    rows = []
+    for row in policy_rows(POLICIES):
+        policy = common.load("pretrained", "policy", row["experiment"], int(row["seed"]))
+        rows += [dict(experiment=row["experiment"], seed=row["seed"]) | point for point in policy["curve"]]
+    (ROOT / "results" / "learning_curves.csv").unlink(missing_ok=True)
+    common.update_csv(ROOT / "results" / "learning_curves.csv", rows, ())
+    (ROOT / "results" / "learning_curves.csv.lock").unlink(missing_ok=True)
+    names = [name for name in POLICIES if select(rows, experiment=name)]
+    figure, axes = common.plt.subplots(2, 4, figsize=(11, 4.6), sharey=True)
+    for ax, name in zip(axes.flat, names):
+        for seed in dict.fromkeys(row["seed"] for row in select(rows, experiment=name)):
+            own = select(rows, experiment=name, seed=seed)
+            for column, colour in (("tracking_error", common.BLUE), ("tracking_error_closed", common.RED)):
+                points = [(row["minutes"], row[column]) for row in own if column in row]
+                if points:
+                    ax.plot(*zip(*points), color=colour, lw=1, label=column.replace("_", " "))
+        ax.set(title=name, xlabel="minutes of training", ylim=(0, 1.1))
+    for ax in axes.flat[len(names):]:
+        ax.axis("off")
+    found = dict(zip(*axes[0, 0].get_legend_handles_labels()[::-1]))
+    figure.legend(found.values(), found, loc="outside lower right")
+    common.save_figure(figure, ROOT, "learning_curves")
 
 
 def copy(path, folder):
@@ -232,12 +256,10 @@ def baselines():
     rows = []
     for row in policy_rows(POLICIES[4:]):
         rows.append([f"`{row['experiment']}`", row["seed"], number(row["train_minutes"], ".0f"), row["updates"],
-                     number(row["tracking_error"]), *(number(row[f"purity_{name}_open"])
-                                                      for name in ("speed", "direction", "curvature"))])
+                     number(row["tracking_error"]), number(row["metric"])])
     if not rows:
         return missing("The baselines are", "python 03_train_policy.py --experiment ant_dads")
-    return markdown(["policy", "seed", "minutes", "updates", "tracking error, open", "purity: speed", "direction",
-                     "curvature"], rows) + absent(POLICIES[4:])
+    return markdown(["policy", "seed", "minutes", "updates", "tracking error, open", "own measure"], rows) + absent(POLICIES[4:])
 
 
 def fig7():
@@ -449,13 +471,14 @@ def full_policies():
                       number(row["tracking_error"], ".3f"), number(row["tracking_error_closed"], ".3f"),
                       *(number(row[f"{key}{end}"], form, scale) for key, form, scale in (
                           ("follow_median_m", ".2f", 1), ("follow_p90_m", ".2f", 1), ("fall_rate", ".2f", 100))
-                        for end in ("_open", "")), number(row["metric"])])
-        second.append([*name, *(f"{number(row[f'purity_{axis}_open'])}, {number(row[f'purity_{axis}'])}"
-                                for axis in common.SINGLE + common.MULTI)])
+                        for end in ("_open", "")), number(row.get("metric"))])
+        if row["method"] == "wedis":
+            second.append([*name, *(f"{number(row.get(f'purity_{axis}_open'))}, {number(row.get(f'purity_{axis}'))}"
+                                    for axis in common.SINGLE + common.MULTI)])
     return markdown(["policy", "seed", "updates", "environment steps", "minutes", "tracking error, open", "closed",
                      "following error, median m, open", "closed", "90 % m, open", "closed", "falls %, open", "closed",
                      "own measure"], first) + [
-        "", "Executed purity, open loop and closed loop (- : not an axis, unused, or no closed loop):", ""] + markdown(
+        "", "Executed purity, open loop and closed loop (- : not an axis, or unused):", ""] + markdown(
         ["policy", "seed", "speed", "direction", "curvature", "acceleration"], second) + absent(POLICIES)
 
 
@@ -521,8 +544,7 @@ SECTIONS = [
     ("Policies (03): policies.csv", "Tracking error: RMS(executed end - predicted end) / RMS(predicted end) over a grid of skills, "
      "100 steps from rest (SeCTAR: 25 draws, 50 steps). Following error: |executed - predicted end| of random skills of 200 steps "
      "(Half-Cheetah: 120) from 400 noisy starts, three in a row. Falls: robots that turn over in that time. Own measure: DADS mutual "
-     "information in nats, SeCTAR reconstruction error. Baselines have no closed loop; their axes are matched to factors "
-     "one-to-one by the executed cross-talk.", full_policies),
+     "information in nats, SeCTAR reconstruction error. Baselines have no closed loop.", full_policies),
     ("Mazes (04): mazes.csv", "Intervals of all planning tables: 95 % bootstrap over policies and trials of each; with one "
      "policy they say nothing about the next one.",
      lambda: full_planning("mazes", "The mazes are", "python 04_mpc_maze.py")),
@@ -565,6 +587,7 @@ def main():
         if not runs.is_dir():
             parser.error(f"{runs} is no folder")
         ship(runs)
+        learning_curves()
     readme = ROOT / "README.md"
     readme.write_text(made(readme.read_text(encoding="utf-8")), encoding="utf-8")
     (ROOT / "results" / "README.md").write_text(results_readme(), encoding="utf-8")

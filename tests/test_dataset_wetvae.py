@@ -284,7 +284,7 @@ def test_an_unused_latent_correlates_with_nothing(s2):
 
 def test_the_shipped_decoder_means_what_its_axes_say(tmp_path):
     for experiment, full in (("main", False), ("full_circle", True)):
-        model = common.load(tmp_path, "wetvae", experiment, 0, quiet=True)
+        model = common.load(tmp_path, "wetvae", experiment, 0)
         decoder = common.unpack(model["decoder"])
         assert model["names"] == ["speed", "direction", "curvature"] and model["length"] == 5
         for axis, name in enumerate(model["names"]):

@@ -20,7 +20,7 @@ def make_policy(folder, experiment, seed=0, decoder=None, **changed):
     content = dict(actor=common.pack(common.Actor(27, 2, 8, 8, True)), decoder=common.pack(decoder), method="wedis",
                    robot="ant", names=["speed", "direction", "curvature"], relation=dict(curvature=0.3), scale=0.1)
     common.save(folder, "policy", experiment, seed, {}, **content | changed)
-    return common.load_policy(folder, experiment, seed, quiet=True)
+    return common.load_policy(folder, experiment, seed)
 
 
 @pytest.fixture(scope="session")
@@ -164,7 +164,7 @@ def test_printed_predicts_by_the_decoder_that_reads_its_own_mean(s4, out, lively
 
 
 def test_closed_loop_predicts_by_first_steps_and_the_relation_function(s4, out, policies):
-    policy = common.load_policy(policies, "ant_semi", 0, quiet=True)
+    policy = common.load_policy(policies, "ant_semi", 0)
     z, delta = s4.skill_pool(unit(s4, out, policy=policy, mode="closed"))
     for t in range(5):
         single = torch.stack([z[:, 0], z[:, 1] + 0.3 * t * z[:, 2], torch.zeros(256)], 1)  # f_dir, t times
