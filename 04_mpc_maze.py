@@ -1,20 +1,18 @@
 """Stage 4: decoder + policy -> mazes solved without training in them (Sec. 5, Algorithm 2, Sec. 6.2).
 
 In: policy_<POLICY>_seed<n>.pt of stage 3. Out: <OUT>/results/<EXPERIMENT>.csv, a row per trial, and figures.
-  python 04_mpc_maze.py                         Fig 3, 6, 8, 17, GIFs, mazes.csv          100 s on two cores
-  python 04_mpc_maze.py --experiment figure7    Fig 7; resumes
-  python 04_mpc_maze.py --experiment fig18      Fig 18: S-maze and obstacles              30 s
+  python 04_mpc_maze.py                         Fig 3, 6, 8, 17, GIFs             100 s on two cores
+  python 04_mpc_maze.py --experiment figure7    Fig 7: all methods; resumes
+  python 04_mpc_maze.py --experiment fig18      Fig 18: S-maze and obstacles      30 s
   python 04_mpc_maze.py --experiment matched    all methods look equally far; resumes
   python 04_mpc_maze.py --experiment drive      a page with a slider for each axis of z
-(The cores were busy with a training, too.) Expect, n = 1 policy (seed 0) and 50 trials, mean final distances
-of 2.9 m and 2.4 m (mazes 1 and 2, dense), 4.4 m and 4.5 m (sparse) as printed; 1.5, 0.7, 3.5, 3.4 m in closed
-loop. The start is 26.8 m from the goal.
+Expect, with policy seed 0 and 50 trials, mean final distances of 2.9 m and 2.4 m (mazes 1 and 2, dense),
+4.4 m and 4.5 m (sparse) as printed; 1.5, 0.7, 3.5, 3.4 m in closed loop. The start is 26.8 m from the goal.
 """
 import hashlib
 import io
 import json
 import logging
-import math
 import time
 from functools import cache, partial
 from itertools import product
@@ -54,7 +52,7 @@ FAST_ONLY = True            # but speed ~ U(0, Z_RANGE): slow is useless here (t
 
 # Planning, App. A.1.4
 SAMPLES = "1000"            # N, sequences of skills per plan; one or more numbers
-LOOK_AHEAD = ""             # steps to plan ahead in place of Table 2's H_P; one or more numbers, or none
+LOOK_AHEAD = "0"            # steps to plan ahead, one or more numbers; 0: Table 2's H_P
 POOL = 65536                # skills are drawn from so many, decoded once (the paper does not say)
 PENALTY = 100.0             # w_p, for each transition of a plan that collides
 REWARD = 5.0                # w_r, sparse reward
@@ -153,15 +151,18 @@ def run(u):
     """Algorithm 2 for all cases and trials of a unit. Returns rows for the CSV and, for figures, of trials 0
     to 2 of each case the poses (steps + 1, nq) and for each decision its step and its path (H_P T + 1, 2).
     A robot that MuJoCo finds unstable starts anew at the origin, and its trial counts where it ends."""
-    skills = u.episode // (u.hold * u.length)
-    ahead = [max(1, steps // (u.hold * u.length)) for steps in u.look_ahead]
-    cases = list(dict.fromkeys(
-        (kind, samples, min(planned, skills)) for kind, samples in product(u.rewards, u.samples)
-        for planned in ahead or [dict(dense=u.planned_dense, sparse=u.planned_sparse)[kind]]))
-    trials = list(product(cases, range(u.trials)))
+    skill_steps = u.hold * u.length
+    skills = u.episode // skill_steps
+    cases = []
+    for kind, samples, steps in product(u.rewards, u.samples, u.look_ahead):
+        planned = u.planned_sparse if kind == "sparse" else u.planned_dense
+        if steps:
+            planned = max(1, steps // skill_steps)
+        cases.append((kind, samples, min(planned, skills)))
+    trials = list(product(dict.fromkeys(cases), range(u.trials)))
     robots = common.Robots(maze_spec(u), len(trials), THREADS)
-    for ids in np.arange(len(trials)).reshape(len(cases), -1):  # every case has the same starts
-        robots.reset(ids, np.random.default_rng(u.seed))
+    for first in range(0, len(trials), u.trials):  # every case has the same starts
+        robots.reset(np.arange(first, first + u.trials), np.random.default_rng(u.seed))
     robots.qpos[:, :2] += u.start
     touch = robots.batch.bind("sensordata")
     torch.manual_seed(u.seed)
@@ -187,8 +188,8 @@ def run(u):
         pose = np.stack([step[n] for step in poses])
         distance = np.linalg.norm(pose[:, :2] - u.goal, axis=1)
         rows.append(dict(
-            maze=u.maze, reward=kind, method=u.method, mode=u.mode,
-            look_ahead=planned * u.hold * u.length, samples=samples, trial=trial, seed=u.seed,
+            maze=u.maze, reward=kind, method=u.method, mode=u.mode, look_ahead=planned * skill_steps,
+            samples=samples, trial=trial, seed=u.seed,
             final_distance=distance[-1], min_distance=distance.min(), success=int(distance[-1] < u.epsilon),
             contacts=contacts[n], path_length=np.linalg.norm(np.diff(pose[:, :2], axis=0), axis=1).sum(),
             planning_ms=1e3 * seconds[n] / skills, policy_seed=u.policy_seed, policy=u.policy.sha256[:8],
@@ -200,27 +201,27 @@ def run(u):
 
 def main():
     units = units_of(*common.parse_flags(globals()))
-    if THREADS < 1:
-        stop("--threads must be at least 1")
     torch.set_num_threads(1)  # tensors are small here; THREADS are for the physics
     if DRIVE:
         return drive(units[0])
-    path, start, examples = Path(OUT) / "results" / f"{EXPERIMENT}.csv", time.time(), []
+    path, start, examples, done = Path(OUT) / "results" / f"{EXPERIMENT}.csv", time.time(), {}, set()
+    if path.exists() and not NEED_PATHS & set(DRAW.split()):
+        done = {row.get("settings") for row in common.read_csv(path)}
     for u in units:
-        what = f"{u.method} {MODE_WORDS[u.mode]}, {u.maze}, policy seed {u.policy_seed}"
-        done = common.read_csv(path) if path.exists() and not NEED_PATHS & set(DRAW.split()) else []
-        if any(row.get("settings") == u.settings for row in done):
-            print(f"{what}: in {path} already, with the same policy and settings")
+        if u.settings in done:
+            print(f"{u.title}: in {path} already, with the same settings")
             continue
         rows, found = run(u)
         common.update_csv(path, rows, ("maze", "method", "mode", "seed", "policy_seed"))
-        examples += found
-        print(f"{time.time() - start:4.0f} s  {what}", flush=True)
+        for example in found:  # figures show the first method, policy, N and look-ahead
+            examples.setdefault((u.maze, u.mode, example.reward, example.trial), example)
+        print(f"{time.time() - start:4.0f} s  {u.title}", flush=True)
     present = {u.settings for u in units}
     rows = [row for row in common.read_csv(path) if row.get("settings") in present]
-    print(f"wrote {path}\n\n{table(rows, units)}\n")
+    print(f"wrote {path}")
+    print_table(rows)
     for name in DRAW.split():
-        DRAWINGS[name](rows, units, examples)
+        DRAWINGS[name](rows, units, list(examples.values()))
 
 
 # ---------------------------------------------------------------- the maze
@@ -243,16 +244,17 @@ def maze_spec(u):
 def collides(path, walls, radius):
     """Which transitions of paths (N, K + 1, 2) touch a wall grown by radius, metres: (N, K) bool. Exact, by
     separating axes: segment and rectangle are apart if they are along x, along y, or across the segment."""
-    x, y = path.unbind(2)
-    low_x, high_x = torch.minimum(x[:, :-1], x[:, 1:]), torch.maximum(x[:, :-1], x[:, 1:])
-    low_y, high_y = torch.minimum(y[:, :-1], y[:, 1:]), torch.maximum(y[:, :-1], y[:, 1:])
-    hit = torch.zeros(low_x.shape, dtype=torch.bool)
+    x, y = path[:, :-1].unbind(2)
+    next_x, next_y = path[:, 1:].unbind(2)
+    dx, dy = next_x - x, next_y - y
+    hit = torch.zeros(x.shape, dtype=torch.bool)
     for x0, x1, y0, y1 in walls:
         x0, x1, y0, y1 = x0 - radius, x1 + radius, y0 - radius, y1 + radius
-        n, k = ((low_x <= x1) & (high_x >= x0) & (low_y <= y1) & (high_y >= y0)).nonzero(as_tuple=True)
-        dx, dy = x[n, k + 1] - x[n, k], y[n, k + 1] - y[n, k]
-        across = dx * (y[n, k] - (y0 + y1) / 2) - dy * (x[n, k] - (x0 + x1) / 2)
-        hit[n, k] |= across.abs() <= (dx.abs() * (y1 - y0) + dy.abs() * (x1 - x0)) / 2
+        beside = (torch.maximum(x, next_x) < x0) | (torch.minimum(x, next_x) > x1)
+        above = (torch.maximum(y, next_y) < y0) | (torch.minimum(y, next_y) > y1)
+        across = dx * (y - (y0 + y1) / 2) - dy * (x - (x0 + x1) / 2)
+        reach = (dx.abs() * (y1 - y0) + dy.abs() * (x1 - x0)) / 2
+        hit |= ~beside & ~above & (across.abs() <= reach)
     return hit
 
 
@@ -268,9 +270,10 @@ def dot(place, colour):
 
 def drive(u):
     """Sliders in a web page command the Ant in real time. mujoco serves the page, to this machine alone."""
-    robots, data, pages, steps = common.Robots(maze_spec(u), 1), mujoco.MjData(maze_spec(u).compile()), [], 0
-    z, pool, start = {"z_" + name: 0.0 for name in u.policy.names}, skill_pool(u), time.monotonic()
-    hand = SimpleNamespace(mode="start again", z=z, closed=True, text="", geoms=[])  # both threads use it
+    robots, data, pool = common.Robots(maze_spec(u), 1), mujoco.MjData(maze_spec(u).compile()), skill_pool(u)
+    hand = SimpleNamespace(mode="start again", closed=True, text="", geoms=[],  # both threads use it
+                           z={"z_" + name: 0.0 for name in u.policy.names})
+    steps, start, pages = 0, time.monotonic(), []
     try:
         from mujoco.studio import launch_web, messages, plugin, viewer_protocol, web_viewer
         from mujoco.studio.dear_imgui import dear_imgui as gui
@@ -289,8 +292,9 @@ def drive(u):
                 z = {name: gui.SliderFloat(name, at, -1.5, 1.5, "%.2f")[1] for name, at in hand.z.items()}
                 if z != hand.z:
                     hand.z, hand.mode = z, "by hand"
-                modes = [m for m in ("stand still", "start again", "plan to the goal") if gui.Button(m)]
-                hand.mode = modes[0] if modes else hand.mode
+                for mode in ("stand still", "start again", "plan to the goal"):
+                    if gui.Button(mode):
+                        hand.mode = mode
                 hand.closed = gui.Checkbox("closed loop", hand.closed)[1]
                 gui.TextUnformatted(hand.text)
                 gui.End()
@@ -306,30 +310,29 @@ def drive(u):
                 if pages and "(0 total)" in pages[-1].getMessage() and time.time() > pages[-1].created + 10:
                     break  # the last page is closed; one that reloads is back sooner
                 if hand.mode == "start again":
-                    hand.mode, asked, age, trail = "stand still", None, 0, []
+                    hand.mode, asked, trail = "stand still", None, []
                     robots.reset([0])
                     robots.qpos[0, :2] += u.start
-                place, mode, z = robots.place()[0], hand.mode, hand.z  # once: the page changes them
-                if asked != (mode, z):
-                    left, age = u.planned_dense, u.hold * u.length
-                if left == 0 and age == u.hold * u.length:  # the last planned skill is over
-                    mode = hand.mode = "stand still"
-                if age == u.hold * u.length:
-                    asked, age, reference, going = (mode, z), 0, place, mode != "stand still"
+                mode, z, closed, place = hand.mode, hand.z, hand.closed, robots.place()[0]
+                if asked != (mode, z, closed):
+                    asked, left, ahead = (mode, z, closed), u.planned_dense, []
+                if not ahead:  # the next skill begins
                     skill = torch.tensor([list(z.values())])
-                    if mode == "plan to the goal":
+                    if mode == "plan to the goal" and left:
                         skill, left = plan(u, "dense", u.samples[0], left, pool, place)[0][None], left - 1
-                    c = going * commands_of(u.policy, skill, u.length)[0].repeat_interleave(u.hold, 0)
-                command = common.closed_loop(c[age][None], reference[None], robots, u.policy.scale)
-                command = command if hand.closed else c[age][None]
-                robots.step(u.policy.actor.act(robots.observe(), command, deterministic=True).numpy())
-                hand.text = f"command {command.norm():.2f}, tracking error {(reference - place).norm():.2f} m"
-                age, steps, reference = age + 1, steps + 1, reference + u.policy.scale * c[age]
-                trail.append(place)
-                ahead = place + u.policy.scale * c.roll(-age, 0).cumsum(0)  # the skill is repeated
+                    elif mode != "by hand":
+                        mode = hand.mode = "stand still"
+                    c = commands_of(u.policy, skill, u.length) * (mode != "stand still")
+                    skill_steps = execute(u.policy, robots, c, u.hold, closed, deterministic=True)
+                    ahead = list(place + u.policy.scale * c[0].repeat_interleave(u.hold, 0).cumsum(0))
+                next(skill_steps)
+                trail.append(robots.place()[0])
+                error = (ahead.pop(0) - trail[-1]).norm()
+                hand.text = f"mean command {c.norm(dim=2).mean():.2f}, tracking error {error:.2f} m"
                 hand.geoms = [dot(p, RED) for p in trail[::10][-200:]] + [dot(p, BLUE) for p in ahead[::10]]
                 data.qpos[:] = robots.qpos[0]
                 handle.sync()
+                steps += 1
                 time.sleep(max(0, start + 0.05 * steps - time.monotonic()))
     except KeyboardInterrupt:
         pass
@@ -342,67 +345,65 @@ def drive(u):
 
 MODE_WORDS = dict(printed="as printed", closed="closed loop")
 OF_A_RUN = "EXPERIMENT OUT THREADS DRAW METHOD MAZES DRIVE SECONDS PORT".split()  # no other row sets these
-load_once, print_once = cache(common.load_policy), cache(print)
+load_once = cache(common.load_policy)
 
 
 def listed(text, name, allowed):
-    """The parts of text, each once: names in the table allowed, or whole numbers from the int allowed on."""
-    parts, numbers = list(dict.fromkeys(text.split())), isinstance(allowed, int)
-    for part in parts:
-        if numbers and not (part.isdecimal() and int(part) >= allowed):
-            stop(f"unknown {part!r} in --{name}; allowed: whole numbers from {allowed}")
-        if not numbers and part not in allowed:
-            stop(f"unknown {part!r} in --{name}; allowed: {' '.join(allowed)}")
-    return [int(part) for part in parts] if numbers else parts
+    """The words of text, each once. Exits with 2 if one is not allowed."""
+    words = list(dict.fromkeys(text.split()))
+    for word in words:
+        if word not in allowed:
+            stop(f"unknown {word!r} in --{name}; allowed: {' '.join(allowed)}")
+    return words
 
 
 def settings(method, maze, config, given):
     """The constants of a method in a maze: those of the file and EXPERIMENTS (config), over them MAZE's row,
     over it METHODS' row, over all the flags (given). Exits with 2 and one line if they make no sense."""
-    rows, of = MAZE[maze] | METHODS[method], f"in the row {maze!r} or {method!r}"
+    rows, of = MAZE[maze] | METHODS[method], f"of {method} in {maze}"
     walls = rows.pop("WALLS", [])
     for name, value in rows.items():
         if name not in config or name in OF_A_RUN:
-            stop(f"{name} {of} is no constant that it may set")
+            stop(f"{name} {of} is no constant that a row may set")
         rows[name] = common.convert(value, config[name], True, f"{name} {of}")
     values = {name.lower(): value for name, value in (config | rows | given).items() if name not in OF_A_RUN}
     u = SimpleNamespace(**values | dict(method=method, maze=maze, walls=walls))
-    for name, allowed in dict(samples=1, look_ahead=1, policy_seeds=0, modes=MODE_WORDS,
-                              rewards=("dense", "sparse")).items():
-        setattr(u, name, listed(values[name], name, allowed))
-    for name in "trials hold length planned_dense planned_sparse pool".split():
-        if values[name] < 1:
-            stop(f"{method} in {maze}: {name} is {values[name]}, but must be at least 1")
+    u.modes = listed(u.modes, "modes", MODE_WORDS)
+    u.rewards = listed(u.rewards, "rewards", ["dense", "sparse"])
+    for name in ("samples", "look_ahead", "policy_seeds"):
+        words = values[name].split() or [""]
+        setattr(u, name, [common.convert(word, 1, False, f"{name} {of}") for word in words])
+    for name in ("samples", "trials", "hold", "length", "planned_dense", "planned_sparse", "pool"):
+        if np.min(getattr(u, name)) < 1:
+            stop(f"{name} {of} is {values[name]}, but must be at least 1")
     if u.episode < u.hold * u.length:
-        stop(f"{method} in {maze}: an episode has {u.episode} steps, but one skill {u.hold * u.length}")
+        stop(f"an episode {of} has {u.episode} steps, but one skill {u.hold * u.length}")
     if not all(len(wall) == 4 and wall[0] < wall[1] and wall[2] < wall[3] for wall in walls):
         stop(f"WALLS {of}: each is (x0, x1, y0, y1) in metres, with x0 < x1 and y0 < y1")
     return u
 
 
 def units_of(config, given):
-    """All units of a run. One that cannot run is left out with a line; exits with 2 if none is left."""
+    """All units of a run. One without a policy is left out with a line; exits with 2 if none is left."""
     units = []
     listed(DRAW, "draw", DRAWINGS)
     for method, maze in product(listed(METHOD, "method", METHODS), listed(MAZES, "mazes", MAZE)):
         shared = settings(method, maze, config, given)
         for mode, seed in product(shared.modes, shared.policy_seeds):
-            u = SimpleNamespace(**vars(shared) | dict(mode=mode, modes="", policy_seed=seed, policy_seeds=""))
-            name = common.artifact_name("policy", u.policy, seed)
+            name = common.artifact_name("policy", shared.policy, seed)
+            title = f"{method} {MODE_WORDS[mode]}, {maze}, {name}"
             if not any((folder / name).exists() for folder in (Path(OUT), common.HERE / "pretrained")):
-                print_once(f"{method} is left out: no {name}; make it with: python 03_train_policy.py "
-                           f"--experiment {u.policy} --seed {seed}")
+                print(f"left out: {title}; make it with: python 03_train_policy.py "
+                      f"--experiment {shared.policy} --seed {seed}")
                 continue
-            policy = load_once(OUT, u.policy, seed)
+            policy = load_once(OUT, shared.policy, seed)
             if policy.robot != "ant" or mode == "closed" and isinstance(policy.decoder, common.SkillDynamics):
-                print_once(f"{method} {MODE_WORDS[mode]} is left out with {name}: the mazes are for the ant, "
-                           "and the closed loop is for commands that are displacements")
-                continue
-            if policy.method not in method:
-                print_once(f"note: {method} plans with {name}, which is trained by {policy.method}")
-            made_by = vars(u) | dict(policy=policy.sha256) | {
-                name: getattr(common, name) for name in ("FEEDBACK", "CORRECTION", "FASTEST", "SOFT_START")}
-            u.settings = hashlib.sha256(json.dumps(made_by, sort_keys=True).encode()).hexdigest()[:8]
+                stop(f"{title}: mazes are for the ant, the closed loop for commands that are displacements")
+            u = SimpleNamespace(**vars(shared) | dict(mode=mode, policy_seed=seed, title=title))
+            del u.modes, u.policy_seeds  # what else is planned changes no result
+            following = common.FEEDBACK, common.CORRECTION, common.FASTEST, common.SOFT_START
+            made_by = json.dumps([vars(u), policy.sha256, following], sort_keys=True)
+            u.settings = hashlib.sha256(made_by.encode()).hexdigest()[:8]
             u.policy = policy
             units.append(u)
     return units or stop("there is nothing to plan: choose --method, --mazes, --modes, --policy_seeds")
@@ -427,34 +428,23 @@ def resampled_means(values, rng, draws=10_000):
     return values[drawn, rng.integers(trials, size=(draws, policies, trials))].mean((1, 2))
 
 
-def table(rows, units):
-    """A line per maze and reward (and method, N, look-ahead if there are several); modes side by side."""
-    several = [name for name in ("method", "samples", "look_ahead") if len({row[name] for row in rows}) > 1]
-    columns, modes = ["maze", "reward", *several], dict.fromkeys(u.mode for u in units)
-    lines = [columns + [words for mode in modes for words in (MODE_WORDS[mode], "success")]]
-    lines.append(["---"] * len(lines[0]))
+def print_table(rows):
+    columns = ["maze", "reward", "method", "mode", "samples", "look_ahead"]
+    print("", " | ".join(columns + ["final distance", "success"]), sep="\n")
     for key in dict.fromkeys(tuple(row[name] for name in columns) for row in rows):
-        lines.append([*key])
-        for mode in modes:
-            where = dict(zip(columns, key), mode=mode)
-            distance, success = (values_of(rows, name, **where) for name in ("final_distance", "success"))
-            lines[-1] += ["", ""]
-            if distance.size:
-                lines[-1][-2:] = f"{distance.mean():.1f} m", f"{100 * success.mean():.0f} %"
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + (
-        f"\nDistance to the goal at the end, mean of {units[0].trials} trials of each policy; success: it is "
-        f"less than {units[0].epsilon:g} m.")
+        distance, success = (values_of(rows, column, **dict(zip(columns, key))).mean()
+                             for column in ("final_distance", "success"))
+        print(" | ".join(key), f"{distance:.1f} m", f"{100 * success:.0f} %", sep=" | ")
 
 
-NAMES = dict(wedis="WEDIS", wedis_s="WEDIS-S", wedis_nts="WEDIS-NTS", dads="DADS", sectar="SeCTAR")
-COLOURS = [BLUE, RED, "#009E73", "#E69F00", "#CC79A7", "#56B4E9"] * 5  # Okabe-Ito
+COLOURS = [BLUE, RED, "#009E73", "#E69F00", "#CC79A7", "#56B4E9"]  # Okabe-Ito
 
 
 def draw_maze(ax, u, title):
     for x0, x1, y0, y1 in u.walls:
         ax.add_patch(plt.Rectangle((x0, y0), x1 - x0, y1 - y0, color="#7a869a", lw=0))
     ax.plot(*u.start, "o", ms=5, color="black")
-    ax.plot(*u.goal, "x", color="black", ms=8, mew=2, label="goal")
+    ax.plot(*u.goal, "o", ms=9, color=RED)
     ax.margins(0)
     ax.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=title)
     ax.grid(False)
@@ -463,112 +453,94 @@ def draw_maze(ax, u, title):
 def draw_fig03(rows, units, examples):
     """Fig 3: trajectory scaling, on a trial's first plan. Left: T predicted steps a skill; right: scaled."""
     u, path = examples[0].u, examples[0].plans[0][1]
-    small = path[0] + (path - path[0]) / u.hold
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.2), width_ratios=(1, 1.6))
     draw_maze(right, u, f"scaled by $H_z$ = {u.hold}")
-    for n, first in enumerate(range(0, len(path) - 1, u.length)):
-        for ax, points in ((left, small), (right, path)):
-            ax.plot(*points[first:first + u.length + 1].T, ".-", color=COLOURS[n], label=f"skill {n + 1}")
     left.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"predicted, $T$ = {u.length} a skill")
-    left.legend(fontsize=8)
+    for first in range(0, len(path) - 1, u.length):
+        skill = path[first:first + u.length + 1]
+        left.plot(*(path[0] + (skill - path[0]) / u.hold).T, ".-")
+        right.plot(*skill.T, ".-")
     common.save_figure(figure, OUT, "fig03_trajectory_scaling")
 
 
 def draw_fig06(rows, units, examples):
     """Fig 6: the navigation tasks, goals as red circles."""
-    mazes = {u.maze: u for u in units}.values()
+    mazes = {u.maze: u for u in units}
     figure, axes = plt.subplots(1, len(mazes), figsize=(4.5 * len(mazes), 3), squeeze=False)
-    for ax, u in zip(axes[0], mazes):
-        draw_maze(ax, u, u.maze)
-        ax.add_patch(plt.Circle(u.goal, 1.0, color=RED, zorder=4))
-        ax.annotate("start", u.start, (5, -12), textcoords="offset points")
+    for ax, (maze, u) in zip(axes[0], mazes.items()):
+        draw_maze(ax, u, maze)
     common.save_figure(figure, OUT, "fig06_mazes")
 
 
 def draw_fig07(rows, units, examples):
     """Fig 7: mean final distance against N, its 95 % interval over policies and trials; thin: each policy."""
     rng, curves = np.random.default_rng(0), dict.fromkeys((u.method, u.mode) for u in units)
-    mazes, kinds = {u.maze: u for u in units}.values(), dict.fromkeys(row["reward"] for row in rows)
-    figure, axes = plt.subplots(len(mazes), len(kinds), squeeze=False, sharex=True, sharey=True,
-                                figsize=(4.3 * len(kinds), 0.8 + 2.7 * len(mazes)))
-    for ax, (u, kind) in zip(axes.flat, product(mazes, kinds)):
+    panels = list(dict.fromkeys((row["maze"], row["reward"]) for row in rows))
+    figure, axes = plt.subplots(1, len(panels), figsize=(3.6 * len(panels), 3.6), sharey=True, squeeze=False)
+    for ax, (maze, kind) in zip(axes[0], panels):
         for n, (method, mode) in enumerate(curves):
-            where = dict(maze=u.maze, reward=kind, method=method, mode=mode)
+            where = dict(maze=maze, reward=kind, method=method, mode=mode)
             sizes = np.array(sorted({int(row["samples"]) for row in rows if row["method"] == method}))
             values = [values_of(rows, "final_distance", samples=size, **where) for size in sizes]
+            mean = np.array([v.mean() for v in values])
             low, high = np.quantile([resampled_means(v, rng) for v in values], [0.025, 0.975], axis=1)
-            mean, closed = np.array([v.mean() for v in values]), mode == "closed"
-            label = NAMES.get(method, method) + ", closed loop" * closed
-            ax.plot(sizes, [v.mean(1) for v in values], color=COLOURS[n], lw=0.5, alpha=0.6)
-            ax.errorbar(sizes * 1.04 ** n, mean, [mean - low, high - mean], color=COLOURS[n], label=label,
-                        ms=4, lw=1.4, capsize=2, marker="osD^vP"[n % 6], ls=["-", "--"][closed])
-        ax.axhline(math.dist(u.start, u.goal), color=GREY, ls=":")
-        ax.set(xscale="log", xlabel="N, samples per plan", title=f"{u.maze}, {kind} reward")
-        ax.set_ylim(0)
-    figure.supylabel("mean final distance (m); dotted: at the start", fontsize=9)
+            ax.plot(sizes, [v.mean(1) for v in values], color=COLOURS[n % 6], lw=0.5, alpha=0.6)
+            ax.errorbar(sizes * 1.04 ** n, mean, [mean - low, high - mean], color=COLOURS[n % 6], capsize=2,
+                        marker="osD^vP"[n % 6], ms=4, label=f"{method}, {MODE_WORDS[mode]}")
+        ax.set(xscale="log", xlabel="N, samples per plan", ylim=(0, None), title=f"{maze}, {kind} reward")
+    axes[0, 0].set_ylabel("mean final distance (m)")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     common.save_figure(figure, OUT, "fig07_planning")
 
 
 def draw_examples(name, kind, rows, units, examples):
     """Fig 8, 17, 18: trials 0 to 2 of each maze and mode. Blue: planned at each decision, red: executed,
-    dashed grey: the error between the ends of the two, cross: the goal."""
-    shown = {}
-    for example in examples:
-        if example.reward == kind:
-            shown.setdefault((example.u.maze, example.u.mode, example.trial), example)
+    dashed grey: the error between the ends of the two."""
+    shown = [example for example in examples if example.reward == kind]
     if not shown:
         return
-    wide = 1 + max(example.trial for example in shown.values())
+    wide = min(3, shown[0].u.trials)
     high = len(shown) // wide
     figure, axes = plt.subplots(high, wide, figsize=(3.6 * wide, 2.4 * high), squeeze=False)
-    for ax, example in zip(axes.flat, shown.values()):
+    for ax, example in zip(axes.flat, shown):
         u, poses = example.u, example.poses
         draw_maze(ax, u, f"{u.maze}, {MODE_WORDS[u.mode]}, trial {example.trial}")
         for first, path in example.plans:
-            path, end = path[:u.length + 1], poses[first + u.hold * u.length, :2]
-            ax.plot(*path.T, ".-", color=BLUE, ms=4, label="predicted")
-            ax.plot(*np.stack([path[-1], end]).T, "--", color=GREY, lw=1.2, label="error of the end")
-        ax.plot(*poses[:, :2].T, color=RED, lw=1.2, label="executed")
-    unique = dict(zip(*axes[0, 0].get_legend_handles_labels()[::-1]))
-    figure.legend(unique.values(), unique, loc="outside lower center", ncols=4)
+            skill, end = path[:u.length + 1], poses[first + u.hold * u.length, :2]
+            ax.plot(*skill.T, ".-", color=BLUE, ms=4)
+            ax.plot(*np.stack([skill[-1], end]).T, "--", color=GREY, lw=1.2)
+        ax.plot(*poses[:, :2].T, color=RED, lw=1.2)
+    figure.supxlabel("blue: predicted, orange: executed, dashed: the error of the end", fontsize=9)
     common.save_figure(figure, OUT, name)
 
 
 def draw_gif(rows, units, examples):
-    """A GIF per maze of trial 0 in the last mode, by MuJoCo's renderer: left the maze, right the Ant."""
-    runs = [example for example in examples if example.trial == 0 and example.u.mode == units[-1].mode]
-    for maze, example in {example.u.maze: example for example in reversed(runs)}.items():
-        model, frames = maze_spec(example.u).compile(), []
+    """A GIF per maze of trial 0 in the last mode, by MuJoCo's renderer. Dots: where the Ant goes."""
+    kind, mode = units[-1].rewards[0], units[-1].mode
+    for example in examples:
+        u, frames = example.u, []
+        if (example.reward, u.mode, example.trial) != (kind, mode, 0):
+            continue
+        spec = maze_spec(u)
+        for x, y in example.poses[::10, :2]:
+            spec.worldbody.add_site(pos=[x, y, 0], size=[0.15, 0.15, 0.15], rgba=[0, 0.45, 0.7, 1])
+        model = spec.compile()
         try:
-            renderer = mujoco.Renderer(model, 240, 360)
+            renderer = mujoco.Renderer(model, 320, 480)
         except Exception:  # no GL library, no display, no device: the kinds differ by platform
-            return print(f"no {maze}.gif: MuJoCo's renderer finds no GL library (install EGL or OSMesa)")
-        data, far, near = mujoco.MjData(model), mujoco.MjvCamera(), mujoco.MjvCamera()
-        walls = np.reshape(example.u.walls, (-1, 4))
-        places = np.concatenate([example.poses[:, :2], walls[:, ::2], walls[:, 1::2]])
-        low, high = places.min(0), places.max(0)
-        far.lookat, far.distance = [*(low + high) / 2, 0], 0.9 * max((high - low) * (1, 1.5))
-        far.azimuth, far.elevation, near.azimuth, near.elevation, near.distance = 90, -70, 90, -35, 5
-        for i in range(0, len(example.poses), 8):
-            data.qpos[:] = example.poses[i]
+            return print(f"no {u.maze}.gif: MuJoCo's renderer finds no GL library (install EGL or OSMesa)")
+        data, camera = mujoco.MjData(model), mujoco.MjvCamera()
+        camera.lookat, camera.distance = model.stat.center, 0.55 * model.stat.extent
+        camera.azimuth, camera.elevation = 90, -65
+        for pose in example.poses[::6]:
+            data.qpos[:] = pose
             mujoco.mj_forward(model, data)
-            near.lookat = data.qpos[:3]
-            views = []
-            for camera in (far, near):
-                renderer.update_scene(data, camera)
-                for x, y in example.poses[:i + 1:10, :2]:  # the path so far
-                    dot = renderer.scene.geoms[renderer.scene.ngeom]
-                    mujoco.mjv_initGeom(dot, mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.2),
-                                        np.array([x, y, 0]), np.eye(3).ravel(), np.float32([0.8, 0.4, 0, 1]))
-                    renderer.scene.ngeom += 1
-                views.append(renderer.render().copy())
-            image = Image.fromarray(np.concatenate(views, 1))
-            frames.append(image.quantize(48, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE))
+            renderer.update_scene(data, camera)
+            frames.append(Image.fromarray(renderer.render()).quantize(48, Image.Quantize.MAXCOVERAGE))
         renderer.close()
         buffer = io.BytesIO()
         frames[0].save(buffer, "GIF", save_all=True, append_images=frames[1:], duration=80, loop=0)
-        print(f"wrote {common.write_whole(Path(OUT) / 'figures' / f'{maze}.gif', buffer.getvalue())}")
+        print(f"wrote {common.write_whole(Path(OUT) / 'figures' / f'{u.maze}.gif', buffer.getvalue())}")
 
 
 DRAWINGS = dict(fig03=draw_fig03, fig06=draw_fig06, fig07=draw_fig07, gif=draw_gif,
