@@ -1,17 +1,16 @@
 """Stage 4: decoder + policy -> mazes solved without training in them (Sec. 5, Algorithm 2, Sec. 6.2).
 
 In: policy_<POLICY>_seed<n>.pt of stage 3. Out: <OUT>/results/<EXPERIMENT>.csv, a row per trial, and figures.
-  python 04_mpc_maze.py                         Fig 3, 6, 8, 17, GIFs             100 s on two cores
-  python 04_mpc_maze.py --experiment figure7    Fig 7: all methods; resumes
-  python 04_mpc_maze.py --experiment fig18      Fig 18: S-maze and obstacles      30 s
+  python 04_mpc_maze.py                         Fig 3, 6, 8, 17, GIFs         100 s on two cores
+  python 04_mpc_maze.py --experiment figure7    Fig 7; resumes
+  python 04_mpc_maze.py --experiment fig18      Fig 18                        30 s
   python 04_mpc_maze.py --experiment matched    all methods look equally far; resumes
   python 04_mpc_maze.py --experiment drive      a page with a slider for each axis of z
-Expect, with policy seed 0 and 50 trials, mean final distances of 2.9 m and 2.4 m (mazes 1 and 2, dense),
-4.4 m and 4.5 m (sparse) as printed; 1.5, 0.7, 3.5, 3.4 m in closed loop. The start is 26.8 m from the goal.
+Expect, of policy seed 0 and 50 trials, mean final distances of 2.9 and 2.4 m (mazes 1 and 2, dense), 4.4 and
+4.5 m (sparse) as printed; 1.5, 0.7, 3.5, 3.4 m in closed loop. The start is 26.8 m from the goal.
 """
 import hashlib
 import io
-import json
 import logging
 import time
 from functools import cache, partial
@@ -24,15 +23,13 @@ from common import BLUE, GREY, RED, commands_of, execute, plt, stop
 import mujoco
 import numpy as np
 import torch
-from matplotlib.colors import to_rgb
 from PIL import Image  # comes with matplotlib
 
 EXPERIMENT = "mazes"        # row of EXPERIMENTS below
 SEED = 0                    # random seed of the trials
 OUT = "runs"                # folder that everything is written to
 THREADS = 2                 # CPU threads
-DRAW = "fig03 fig06 fig08 fig17 gif"  # what is made of the trials; also fig07 fig18
-
+DRAW = "fig03 fig06 fig08 fig17 gif"  # rows of DRAWINGS below
 METHOD = "wedis"            # rows of METHODS below
 MAZES = "maze1 maze2"       # rows of MAZE below
 REWARDS = "dense sparse"    # Sec. 6.2
@@ -103,8 +100,8 @@ MAZE = {  # walls, and the constants in which a maze differs; plan a row of your
 # flags. All its cases (reward, N, H_P) with all their trials run in one simulation.
 
 def skill_pool(u):
-    """The skills that plans draw from, decoded once: z (POOL, M), and the displacements that they predict
-    (POOL, T, 2), trajectory units. Printed: the decoder's mean for T free steps; closed: the commands."""
+    """The skills that plans draw from: z (POOL, M), and the displacements that they predict (POOL, T, 2),
+    trajectory units. Printed: the decoder's mean for T free steps; closed: the commands."""
     high = torch.full((u.policy.decoder.arguments[0],), u.z_range)
     low = -high
     if u.fast_only and "speed" in u.policy.names:
@@ -148,8 +145,8 @@ def plan(u, kind, samples, horizon, pool, s0):
 
 
 def run(u):
-    """Algorithm 2 for all cases and trials of a unit. Returns rows for the CSV and, for figures, of trials 0
-    to 2 of each case the poses (steps + 1, nq) and for each decision its step and its path (H_P T + 1, 2).
+    """Algorithm 2 for all cases and trials of a unit. Returns rows for the CSV and, for figures, trials 0 to
+    2 of each case with their poses (steps + 1, nq) and for each decision its step and path (H_P T + 1, 2).
     A robot that MuJoCo finds unstable starts anew at the origin, and its trial counts where it ends."""
     skill_steps = u.hold * u.length
     skills = u.episode // skill_steps
@@ -159,44 +156,43 @@ def run(u):
         if steps:
             planned = max(1, steps // skill_steps)
         cases.append((kind, samples, min(planned, skills)))
-    trials = list(product(dict.fromkeys(cases), range(u.trials)))
+    trials = []
+    for (kind, samples, planned), trial in product(dict.fromkeys(cases), range(u.trials)):
+        trials.append(SimpleNamespace(u=u, reward=kind, samples=samples, planned=planned, trial=trial,
+                                      plans=[], seconds=0.0))
     robots = common.Robots(maze_spec(u), len(trials), THREADS)
     for first in range(0, len(trials), u.trials):  # every case has the same starts
         robots.reset(np.arange(first, first + u.trials), np.random.default_rng(u.seed))
     robots.qpos[:, :2] += u.start
-    touch = robots.batch.bind("sensordata")
+    touch, contacts = robots.batch.bind("sensordata"), np.zeros(len(trials), int)
     torch.manual_seed(u.seed)
-    pool, closed = skill_pool(u), u.mode == "closed"
-    poses, plans = [robots.qpos.copy()], [[] for _ in trials]
-    contacts, seconds = np.zeros(len(trials), int), np.zeros(len(trials))
+    pool, closed, poses = skill_pool(u), u.mode == "closed", [robots.qpos.copy()]
     for i in range(skills):                                                 # line 1
         chosen = []
-        for n, ((kind, samples, planned), _) in enumerate(trials):
+        for t, s0 in zip(trials, robots.place()):
             clock = time.perf_counter()
-            horizon = min(planned, skills - i)  # no plan looks beyond the end of the episode
-            z, path = plan(u, kind, samples, horizon, pool, robots.place()[n])  # lines 2 to 12
-            seconds[n] += time.perf_counter() - clock
+            horizon = min(t.planned, skills - i)  # no plan looks beyond the end of the episode
+            z, path = plan(u, t.reward, t.samples, horizon, pool, s0)       # lines 2 to 12
+            t.seconds += time.perf_counter() - clock
+            t.plans.append((len(poses) - 1, path.numpy()))
             chosen.append(z)
-            plans[n].append((len(poses) - 1, path.numpy()))
         commands = commands_of(u.policy, torch.stack(chosen), u.length)     # lines 17 and 18
         for _ in execute(u.policy, robots, commands, u.hold, closed, deterministic=closed):  # lines 13 to 19
             contacts += touch[:, 0] > 0
             poses.append(robots.qpos.copy())                                # line 20
 
-    rows, examples = [], []
-    for n, ((kind, samples, planned), trial) in enumerate(trials):
-        pose = np.stack([step[n] for step in poses])
-        distance = np.linalg.norm(pose[:, :2] - u.goal, axis=1)
+    rows = []
+    for n, t in enumerate(trials):
+        t.poses = np.stack([pose[n] for pose in poses])
+        distance = np.linalg.norm(t.poses[:, :2] - u.goal, axis=1)
+        length = np.linalg.norm(np.diff(t.poses[:, :2], axis=0), axis=1).sum()
         rows.append(dict(
-            maze=u.maze, reward=kind, method=u.method, mode=u.mode, look_ahead=planned * skill_steps,
-            samples=samples, trial=trial, seed=u.seed,
-            final_distance=distance[-1], min_distance=distance.min(), success=int(distance[-1] < u.epsilon),
-            contacts=contacts[n], path_length=np.linalg.norm(np.diff(pose[:, :2], axis=0), axis=1).sum(),
-            planning_ms=1e3 * seconds[n] / skills, policy_seed=u.policy_seed, policy=u.policy.sha256[:8],
-            settings=u.settings))
-        if trial < 3:
-            examples.append(SimpleNamespace(u=u, trial=trial, reward=kind, poses=pose, plans=plans[n]))
-    return rows, examples
+            maze=u.maze, reward=t.reward, method=u.method, mode=u.mode, look_ahead=t.planned * skill_steps,
+            samples=t.samples, trial=t.trial, seed=u.seed, final_distance=distance[-1],
+            min_distance=distance.min(), success=int(distance[-1] < u.epsilon), contacts=contacts[n],
+            path_length=length, planning_ms=1e3 * t.seconds / skills, policy_seed=u.policy_seed,
+            policy=u.policy.sha256[:8], settings=u.settings))
+    return rows, [t for t in trials if t.trial < 3]
 
 
 def main():
@@ -204,7 +200,7 @@ def main():
     torch.set_num_threads(1)  # tensors are small here; THREADS are for the physics
     if DRIVE:
         return drive(units[0])
-    path, start, examples, done = Path(OUT) / "results" / f"{EXPERIMENT}.csv", time.time(), {}, set()
+    path, start, examples, done = Path(OUT) / "results" / f"{EXPERIMENT}.csv", time.time(), [], set()
     if path.exists() and not NEED_PATHS & set(DRAW.split()):
         done = {row.get("settings") for row in common.read_csv(path)}
     for u in units:
@@ -213,18 +209,17 @@ def main():
             continue
         rows, found = run(u)
         common.update_csv(path, rows, ("maze", "method", "mode", "seed", "policy_seed"))
-        for example in found:  # figures show the first method, policy, N and look-ahead
-            examples.setdefault((u.maze, u.mode, example.reward, example.trial), example)
-        print(f"{time.time() - start:4.0f} s  {u.title}", flush=True)
+        examples += found
+        for first in range(0, len(rows), u.trials):
+            ends = [row["final_distance"] for row in rows[first:first + u.trials]]
+            print(f"{time.time() - start:4.0f} s  {u.title}, {rows[first]['reward']} reward, "
+                  f"N = {rows[first]['samples']}: ends {np.mean(ends):.1f} m from the goal", flush=True)
     present = {u.settings for u in units}
     rows = [row for row in common.read_csv(path) if row.get("settings") in present]
     print(f"wrote {path}")
-    print_table(rows)
     for name in DRAW.split():
-        DRAWINGS[name](rows, units, list(examples.values()))
+        DRAWINGS[name](rows, units, examples)
 
-
-# ---------------------------------------------------------------- the maze
 
 def maze_spec(u):
     """The Ant between real walls 1 m high, a sensor of their contacts, and the goal as a red disc."""
@@ -244,27 +239,26 @@ def maze_spec(u):
 def collides(path, walls, radius):
     """Which transitions of paths (N, K + 1, 2) touch a wall grown by radius, metres: (N, K) bool. Exact, by
     separating axes: segment and rectangle are apart if they are along x, along y, or across the segment."""
-    x, y = path[:, :-1].unbind(2)
-    next_x, next_y = path[:, 1:].unbind(2)
-    dx, dy = next_x - x, next_y - y
-    hit = torch.zeros(x.shape, dtype=torch.bool)
+    x, y = path.unbind(2)
+    low_x, high_x = torch.minimum(x[:, :-1], x[:, 1:]), torch.maximum(x[:, :-1], x[:, 1:])
+    low_y, high_y = torch.minimum(y[:, :-1], y[:, 1:]), torch.maximum(y[:, :-1], y[:, 1:])
+    hit = torch.zeros(low_x.shape, dtype=torch.bool)
     for x0, x1, y0, y1 in walls:
         x0, x1, y0, y1 = x0 - radius, x1 + radius, y0 - radius, y1 + radius
-        beside = (torch.maximum(x, next_x) < x0) | (torch.minimum(x, next_x) > x1)
-        above = (torch.maximum(y, next_y) < y0) | (torch.minimum(y, next_y) > y1)
-        across = dx * (y - (y0 + y1) / 2) - dy * (x - (x0 + x1) / 2)
-        reach = (dx.abs() * (y1 - y0) + dy.abs() * (x1 - x0)) / 2
-        hit |= ~beside & ~above & (across.abs() <= reach)
+        n, k = ((low_x <= x1) & (high_x >= x0) & (low_y <= y1) & (high_y >= y0)).nonzero(as_tuple=True)
+        dx, dy = x[n, k + 1] - x[n, k], y[n, k + 1] - y[n, k]
+        across = dx * (y[n, k] - (y0 + y1) / 2) - dy * (x[n, k] - (x0 + x1) / 2)
+        hit[n, k] |= across.abs() <= (dx.abs() * (y1 - y0) + dy.abs() * (x1 - x0)) / 2
     return hit
 
 
 # ---------------------------------------------------------------- driving by hand: not in the paper
 
-def dot(place, colour):
-    """A ball on the floor at place (2,), metres, for MuJoCo's renderers."""
+def dot(place, *colour):
+    """A ball on the floor at place (2,), metres, for MuJoCo's viewer."""
     geom = mujoco.MjvGeom()
     mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.1), np.array([*place, 0.1]),
-                        np.eye(3).ravel(), np.float32([*to_rgb(colour), 1]))
+                        np.eye(3).ravel(), np.float32(colour))
     return geom
 
 
@@ -273,7 +267,7 @@ def drive(u):
     robots, data, pool = common.Robots(maze_spec(u), 1), mujoco.MjData(maze_spec(u).compile()), skill_pool(u)
     hand = SimpleNamespace(mode="start again", closed=True, text="", geoms=[],  # both threads use it
                            z={"z_" + name: 0.0 for name in u.policy.names})
-    steps, start, pages = 0, time.monotonic(), []
+    asked, steps, start, pages = None, 0, time.monotonic(), []
     try:
         from mujoco.studio import launch_web, messages, plugin, viewer_protocol, web_viewer
         from mujoco.studio.dear_imgui import dear_imgui as gui
@@ -309,15 +303,15 @@ def drive(u):
             while handle.is_running() and not 0 < SECONDS <= time.monotonic() - start:
                 if pages and "(0 total)" in pages[-1].getMessage() and time.time() > pages[-1].created + 10:
                     break  # the last page is closed; one that reloads is back sooner
-                if hand.mode == "start again":
-                    hand.mode, asked, trail = "stand still", None, []
-                    robots.reset([0])
-                    robots.qpos[0, :2] += u.start
-                mode, z, closed, place = hand.mode, hand.z, hand.closed, robots.place()[0]
+                mode, z, closed = hand.mode, hand.z, hand.closed
                 if asked != (mode, z, closed):
                     asked, left, ahead = (mode, z, closed), u.planned_dense, []
-                if not ahead:  # the next skill begins
-                    skill = torch.tensor([list(z.values())])
+                if not ahead:  # a skill begins
+                    if mode == "start again":
+                        robots.reset([0])
+                        robots.qpos[0, :2] += u.start
+                        trail = []
+                    place, skill = robots.place()[0], torch.tensor([list(z.values())])
                     if mode == "plan to the goal" and left:
                         skill, left = plan(u, "dense", u.samples[0], left, pool, place)[0][None], left - 1
                     elif mode != "by hand":
@@ -329,7 +323,8 @@ def drive(u):
                 trail.append(robots.place()[0])
                 error = (ahead.pop(0) - trail[-1]).norm()
                 hand.text = f"mean command {c.norm(dim=2).mean():.2f}, tracking error {error:.2f} m"
-                hand.geoms = [dot(p, RED) for p in trail[::10][-200:]] + [dot(p, BLUE) for p in ahead[::10]]
+                hand.geoms = [dot(p, 0.8, 0.4, 0, 1) for p in trail[::10][-200:]]  # orange
+                hand.geoms += [dot(p, 0, 0.4, 0.7, 1) for p in ahead[::10]]  # blue
                 data.qpos[:] = robots.qpos[0]
                 handle.sync()
                 steps += 1
@@ -343,18 +338,16 @@ def drive(u):
 
 # ---------------------------------------------------------------- what is planned: rows, flags, checks
 
-MODE_WORDS = dict(printed="as printed", closed="closed loop")
 OF_A_RUN = "EXPERIMENT OUT THREADS DRAW METHOD MAZES DRIVE SECONDS PORT".split()  # no other row sets these
 load_once = cache(common.load_policy)
 
 
-def listed(text, name, allowed):
-    """The words of text, each once. Exits with 2 if one is not allowed."""
-    words = list(dict.fromkeys(text.split()))
-    for word in words:
+def words(text, name, allowed):
+    """The words of text. Exits with 2 if one is not allowed."""
+    for word in text.split():
         if word not in allowed:
             stop(f"unknown {word!r} in --{name}; allowed: {' '.join(allowed)}")
-    return words
+    return text.split()
 
 
 def settings(method, maze, config, given):
@@ -368,13 +361,13 @@ def settings(method, maze, config, given):
         rows[name] = common.convert(value, config[name], True, f"{name} {of}")
     values = {name.lower(): value for name, value in (config | rows | given).items() if name not in OF_A_RUN}
     u = SimpleNamespace(**values | dict(method=method, maze=maze, walls=walls))
-    u.modes = listed(u.modes, "modes", MODE_WORDS)
-    u.rewards = listed(u.rewards, "rewards", ["dense", "sparse"])
+    u.modes = words(u.modes, "modes", ["printed", "closed"])
+    u.rewards = words(u.rewards, "rewards", ["dense", "sparse"])
     for name in ("samples", "look_ahead", "policy_seeds"):
-        words = values[name].split() or [""]
-        setattr(u, name, [common.convert(word, 1, False, f"{name} {of}") for word in words])
+        numbers = [common.convert(word, 1, False, f"{name} {of}") for word in values[name].split()]
+        setattr(u, name, numbers)
     for name in ("samples", "trials", "hold", "length", "planned_dense", "planned_sparse", "pool"):
-        if np.min(getattr(u, name)) < 1:
+        if np.min(getattr(u, name), initial=1) < 1:
             stop(f"{name} {of} is {values[name]}, but must be at least 1")
     if u.episode < u.hold * u.length:
         stop(f"an episode {of} has {u.episode} steps, but one skill {u.hold * u.length}")
@@ -386,14 +379,14 @@ def settings(method, maze, config, given):
 def units_of(config, given):
     """All units of a run. One without a policy is left out with a line; exits with 2 if none is left."""
     units = []
-    listed(DRAW, "draw", DRAWINGS)
-    for method, maze in product(listed(METHOD, "method", METHODS), listed(MAZES, "mazes", MAZE)):
+    words(DRAW, "draw", DRAWINGS)
+    for method, maze in product(words(METHOD, "method", METHODS), words(MAZES, "mazes", MAZE)):
         shared = settings(method, maze, config, given)
         for mode, seed in product(shared.modes, shared.policy_seeds):
+            title = f"{method} {mode}, {maze}, {shared.policy} seed {seed}"
             name = common.artifact_name("policy", shared.policy, seed)
-            title = f"{method} {MODE_WORDS[mode]}, {maze}, {name}"
             if not any((folder / name).exists() for folder in (Path(OUT), common.HERE / "pretrained")):
-                print(f"left out: {title}; make it with: python 03_train_policy.py "
+                print(f"{title} is left out: no {name}; make it with: python 03_train_policy.py "
                       f"--experiment {shared.policy} --seed {seed}")
                 continue
             policy = load_once(OUT, shared.policy, seed)
@@ -402,64 +395,32 @@ def units_of(config, given):
             u = SimpleNamespace(**vars(shared) | dict(mode=mode, policy_seed=seed, title=title))
             del u.modes, u.policy_seeds  # what else is planned changes no result
             following = common.FEEDBACK, common.CORRECTION, common.FASTEST, common.SOFT_START
-            made_by = json.dumps([vars(u), policy.sha256, following], sort_keys=True)
+            made_by = repr([sorted(vars(u).items()), policy.sha256, following])
             u.settings = hashlib.sha256(made_by.encode()).hexdigest()[:8]
             u.policy = policy
             units.append(u)
     return units or stop("there is nothing to plan: choose --method, --mazes, --modes, --policy_seeds")
 
 
-# ---------------------------------------------------------------- measuring, drawing: not part of the method
-
-def values_of(rows, column, **where):
-    """A column of the rows that agree with where: (policies, trials), empty if there are none."""
-    found = {}
-    for row in rows:
-        if all(row[name] == str(value) for name, value in where.items()):
-            found.setdefault(row["policy_seed"], []).append(float(row[column]))
-    return np.array(list(found.values()))
-
-
-def resampled_means(values, rng, draws=10_000):
-    """Means (draws,) of values (policies, trials), policies and trials of each drawn with replacement (the
-    hierarchical bootstrap): trials of one policy alone say nothing about the next policy."""
-    policies, trials = values.shape
-    drawn = rng.integers(policies, size=(draws, policies, 1))
-    return values[drawn, rng.integers(trials, size=(draws, policies, trials))].mean((1, 2))
-
-
-def print_table(rows):
-    columns = ["maze", "reward", "method", "mode", "samples", "look_ahead"]
-    print("", " | ".join(columns + ["final distance", "success"]), sep="\n")
-    for key in dict.fromkeys(tuple(row[name] for name in columns) for row in rows):
-        distance, success = (values_of(rows, column, **dict(zip(columns, key))).mean()
-                             for column in ("final_distance", "success"))
-        print(" | ".join(key), f"{distance:.1f} m", f"{100 * success:.0f} %", sep=" | ")
-
-
-COLOURS = [BLUE, RED, "#009E73", "#E69F00", "#CC79A7", "#56B4E9"]  # Okabe-Ito
-
+# ---------------------------------------------------------------- drawing: not part of the method
 
 def draw_maze(ax, u, title):
     for x0, x1, y0, y1 in u.walls:
         ax.add_patch(plt.Rectangle((x0, y0), x1 - x0, y1 - y0, color="#7a869a", lw=0))
     ax.plot(*u.start, "o", ms=5, color="black")
     ax.plot(*u.goal, "o", ms=9, color=RED)
-    ax.margins(0)
     ax.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=title)
-    ax.grid(False)
 
 
 def draw_fig03(rows, units, examples):
-    """Fig 3: trajectory scaling, on a trial's first plan. Left: T predicted steps a skill; right: scaled."""
+    """Fig 3: trajectory scaling, on a trial's first plan: the same shape, H_z times as large."""
     u, path = examples[0].u, examples[0].plans[0][1]
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.2), width_ratios=(1, 1.6))
-    draw_maze(right, u, f"scaled by $H_z$ = {u.hold}")
-    left.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"predicted, $T$ = {u.length} a skill")
-    for first in range(0, len(path) - 1, u.length):
-        skill = path[first:first + u.length + 1]
-        left.plot(*(path[0] + (skill - path[0]) / u.hold).T, ".-")
-        right.plot(*skill.T, ".-")
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2))
+    titles = f"predicted, $T$ = {u.length} a skill", f"scaled by $H_z$ = {u.hold}"
+    for ax, title, shrink in zip(axes, titles, (u.hold, 1)):
+        for first in range(0, len(path) - 1, u.length):
+            ax.plot(*((path[first:first + u.length + 1] - path[0]) / shrink).T, ".-")
+        ax.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=title)
     common.save_figure(figure, OUT, "fig03_trajectory_scaling")
 
 
@@ -473,74 +434,69 @@ def draw_fig06(rows, units, examples):
 
 
 def draw_fig07(rows, units, examples):
-    """Fig 7: mean final distance against N, its 95 % interval over policies and trials; thin: each policy."""
-    rng, curves = np.random.default_rng(0), dict.fromkeys((u.method, u.mode) for u in units)
-    panels = list(dict.fromkeys((row["maze"], row["reward"]) for row in rows))
-    figure, axes = plt.subplots(1, len(panels), figsize=(3.6 * len(panels), 3.6), sharey=True, squeeze=False)
-    for ax, (maze, kind) in zip(axes[0], panels):
-        for n, (method, mode) in enumerate(curves):
-            where = dict(maze=maze, reward=kind, method=method, mode=mode)
-            sizes = np.array(sorted({int(row["samples"]) for row in rows if row["method"] == method}))
-            values = [values_of(rows, "final_distance", samples=size, **where) for size in sizes]
-            mean = np.array([v.mean() for v in values])
-            low, high = np.quantile([resampled_means(v, rng) for v in values], [0.025, 0.975], axis=1)
-            ax.plot(sizes, [v.mean(1) for v in values], color=COLOURS[n % 6], lw=0.5, alpha=0.6)
-            ax.errorbar(sizes * 1.04 ** n, mean, [mean - low, high - mean], color=COLOURS[n % 6], capsize=2,
-                        marker="osD^vP"[n % 6], ms=4, label=f"{method}, {MODE_WORDS[mode]}")
-        ax.set(xscale="log", xlabel="N, samples per plan", ylim=(0, None), title=f"{maze}, {kind} reward")
-    axes[0, 0].set_ylabel("mean final distance (m)")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    """Fig 7: final distance against N; lines: the mean, bands: half of the trials of all policies."""
+    panels = dict.fromkeys((row["maze"], row["reward"]) for row in rows)
+    curves = dict.fromkeys((u.method, u.mode) for u in units)
+    colours = [BLUE, RED, "#009E73", "#E69F00", "#CC79A7", "#56B4E9"]  # Okabe-Ito
+    figure, axes = plt.subplots(1, len(panels), figsize=(3.6 * len(panels), 4), sharey=True, squeeze=False)
+    for ax, panel in zip(axes[0], panels):
+        for n, curve in enumerate(curves):
+            ends = {}
+            for row in rows:
+                if (row["maze"], row["reward"], row["method"], row["mode"]) == panel + curve:
+                    ends.setdefault(int(row["samples"]), []).append(float(row["final_distance"]))
+            values, colour = np.array([*ends.values()]), colours[n % 6]
+            ax.fill_between([*ends], *np.quantile(values, [0.25, 0.75], axis=1), color=colour, alpha=0.1)
+            ax.plot([*ends], values.mean(1), marker="osD^vP"[n % 6], color=colour, label=", ".join(curve))
+        ax.set(xscale="log", xlabel="N, samples per plan", ylim=(0, None), title=", ".join(panel))
+    axes[0, 0].set_ylabel("final distance (m)")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     common.save_figure(figure, OUT, "fig07_planning")
 
 
 def draw_examples(name, kind, rows, units, examples):
-    """Fig 8, 17, 18: trials 0 to 2 of each maze and mode. Blue: planned at each decision, red: executed,
-    dashed grey: the error between the ends of the two."""
+    """Fig 8, 17, 18, a row per unit. Blue: predicted, orange: executed, dashed: the error of the end."""
     shown = [example for example in examples if example.reward == kind]
     if not shown:
         return
-    wide = min(3, shown[0].u.trials)
-    high = len(shown) // wide
-    figure, axes = plt.subplots(high, wide, figsize=(3.6 * wide, 2.4 * high), squeeze=False)
+    columns = min(3, shown[0].u.trials)
+    rows = len(shown) // columns
+    figure, axes = plt.subplots(rows, columns, figsize=(3.6 * columns, 2.4 * rows), squeeze=False)
     for ax, example in zip(axes.flat, shown):
         u, poses = example.u, example.poses
-        draw_maze(ax, u, f"{u.maze}, {MODE_WORDS[u.mode]}, trial {example.trial}")
+        draw_maze(ax, u, u.title)
         for first, path in example.plans:
             skill, end = path[:u.length + 1], poses[first + u.hold * u.length, :2]
             ax.plot(*skill.T, ".-", color=BLUE, ms=4)
             ax.plot(*np.stack([skill[-1], end]).T, "--", color=GREY, lw=1.2)
         ax.plot(*poses[:, :2].T, color=RED, lw=1.2)
-    figure.supxlabel("blue: predicted, orange: executed, dashed: the error of the end", fontsize=9)
     common.save_figure(figure, OUT, name)
 
 
 def draw_gif(rows, units, examples):
-    """A GIF per maze of trial 0 in the last mode, by MuJoCo's renderer. Dots: where the Ant goes."""
-    kind, mode = units[-1].rewards[0], units[-1].mode
-    for example in examples:
-        u, frames = example.u, []
-        if (example.reward, u.mode, example.trial) != (kind, mode, 0):
-            continue
-        spec = maze_spec(u)
+    """A GIF per maze: trial 0 of the last reward and mode. Dots: where the Ant goes."""
+    shown = {example.u.maze: example for example in examples if example.trial == 0}  # the last of each maze
+    for maze, example in shown.items():
+        frames, spec = [], maze_spec(example.u)
         for x, y in example.poses[::10, :2]:
             spec.worldbody.add_site(pos=[x, y, 0], size=[0.15, 0.15, 0.15], rgba=[0, 0.45, 0.7, 1])
         model = spec.compile()
         try:
             renderer = mujoco.Renderer(model, 320, 480)
         except Exception:  # no GL library, no display, no device: the kinds differ by platform
-            return print(f"no {u.maze}.gif: MuJoCo's renderer finds no GL library (install EGL or OSMesa)")
-        data, camera = mujoco.MjData(model), mujoco.MjvCamera()
-        camera.lookat, camera.distance = model.stat.center, 0.55 * model.stat.extent
-        camera.azimuth, camera.elevation = 90, -65
+            return print(f"no {maze}.gif: MuJoCo's renderer finds no GL library (install EGL or OSMesa)")
+        model.vis.global_.azimuth, model.vis.global_.elevation = 90, -65
+        model.stat.extent *= 0.37  # the camera stands near enough for the walls to fill the picture
+        data = mujoco.MjData(model)
         for pose in example.poses[::6]:
             data.qpos[:] = pose
             mujoco.mj_forward(model, data)
-            renderer.update_scene(data, camera)
+            renderer.update_scene(data)
             frames.append(Image.fromarray(renderer.render()).quantize(48, Image.Quantize.MAXCOVERAGE))
         renderer.close()
         buffer = io.BytesIO()
         frames[0].save(buffer, "GIF", save_all=True, append_images=frames[1:], duration=80, loop=0)
-        print(f"wrote {common.write_whole(Path(OUT) / 'figures' / f'{u.maze}.gif', buffer.getvalue())}")
+        print(f"wrote {common.write_whole(Path(OUT) / 'figures' / f'{maze}.gif', buffer.getvalue())}")
 
 
 DRAWINGS = dict(fig03=draw_fig03, fig06=draw_fig06, fig07=draw_fig07, gif=draw_gif,
