@@ -1,11 +1,8 @@
 """Stage 4: decoder + policy -> mazes solved without training in them (Sec. 5, Algorithm 2, Sec. 6.2).
 
 In: policy_<POLICY>_seed<n>.pt of stage 3. Out: <OUT>/results/<EXPERIMENT>.csv, a row per trial, and figures.
-  python 04_mpc_maze.py                         Fig 3, 6, 8, 17, GIFs         100 s on two cores
-  python 04_mpc_maze.py --experiment figure7    Fig 7; resumes
-  python 04_mpc_maze.py --experiment fig18      Fig 18                        30 s
-  python 04_mpc_maze.py --experiment matched    all methods look equally far; resumes
-  python 04_mpc_maze.py --experiment drive      a page with a slider for each axis of z
+  python 04_mpc_maze.py                          Fig 3, 6, 8, 17 and GIFs, 100 s on two cores
+  python 04_mpc_maze.py --experiment figure7     or another row of EXPERIMENTS below
 Expect, of policy seed 0 and 50 trials, mean final distances of 2.9 and 2.4 m (mazes 1 and 2, dense), 4.4 and
 4.5 m (sparse) as printed; 1.5, 0.7, 3.5, 3.4 m in closed loop. The start is 26.8 m from the goal.
 """
@@ -30,6 +27,10 @@ SEED = 0                    # random seed of the trials
 OUT = "runs"                # folder that everything is written to
 THREADS = 2                 # CPU threads
 DRAW = "fig03 fig06 fig08 fig17 gif"  # rows of DRAWINGS below
+DRIVE = False               # true: plan nothing, serve a page with a slider for each axis of z
+SECONDS = 0.0               # until the page ends by itself; 0: when it is closed
+PORT = 8080                 # of the page, on this machine alone; 0: the first free one
+
 METHOD = "wedis"            # rows of METHODS below
 MAZES = "maze1 maze2"       # rows of MAZE below
 REWARDS = "dense sparse"    # Sec. 6.2
@@ -58,11 +59,6 @@ RADIUS = 1.0                # metres by which the planner grows the walls: the r
 START = (0.0, 0.0)          # x and y, metres
 GOAL = (24.0, 12.0)         # 26.8 m away, 36 m along the axes
 
-# Driving by hand
-DRIVE = False               # true: plan nothing, serve a page with a slider for each axis of z
-SECONDS = 0.0               # until it ends by itself; 0: when the page is closed
-PORT = 8080                 # of the page, on this machine alone; 0: the first free one
-
 METHODS = {  # Table 2; a row wins over a maze's, or a maze would give a scale to WEDIS-NTS
     "wedis": {},
     "wedis_s": dict(MODES="printed", LENGTH=1, PLANNED_DENSE=4, PLANNED_SPARSE=15),  # single steps
@@ -76,10 +72,11 @@ METHODS = {  # Table 2; a row wins over a maze's, or a maze would give a scale t
 EXPERIMENTS = {  # a row names the constants in which an experiment differs; its name is that of its CSV
     "mazes": {},
     "figure7": dict(METHOD=" ".join(METHODS), POLICY_SEEDS="0 1 2", TRIALS=20, DRAW="fig07",
-                    SAMPLES="10 30 100 300 1000 3000"),
+                    SAMPLES="10 30 100 300 1000 3000"),  # stopped and started again, it resumes
     "fig18": dict(MAZES="s_maze obstacles", REWARDS="dense", MODES="closed", POLICY_SEEDS="0 1 2",
-                  DRAW="fig18"),
+                  DRAW="fig18"),  # 30 s
     "drive": dict(DRIVE=True, MAZES="open", MODES="closed"),
+    # all methods look equally far ahead
     "matched": dict(METHOD=" ".join(METHODS), POLICY_SEEDS="0 1 2", TRIALS=20, DRAW="", LOOK_AHEAD="200 600"),
 }
 HULL = [(-7, -6, -7, 19), (31, 32, -7, 19), (-7, 32, -7, -6), (-7, 32, 18, 19)]  # x0, x1, y0, y1, metres
@@ -146,8 +143,7 @@ def plan(u, kind, samples, horizon, pool, s0):
 
 def run(u):
     """Algorithm 2 for all cases and trials of a unit. Returns rows for the CSV and, for figures, trials 0 to
-    2 of each case with their poses (steps + 1, nq) and for each decision its step and path (H_P T + 1, 2).
-    A robot that MuJoCo finds unstable starts anew at the origin, and its trial counts where it ends."""
+    2 of each case with their poses (steps + 1, nq) and for each decision its step and path (H_P T + 1, 2)."""
     skill_steps = u.hold * u.length
     skills = u.episode // skill_steps
     cases = []
@@ -156,11 +152,9 @@ def run(u):
         if steps:
             planned = max(1, steps // skill_steps)
         cases.append((kind, samples, min(planned, skills)))
-    trials = []
-    for (kind, samples, planned), trial in product(dict.fromkeys(cases), range(u.trials)):
-        trials.append(SimpleNamespace(u=u, reward=kind, samples=samples, planned=planned, trial=trial,
-                                      plans=[], seconds=0.0))
-    robots = common.Robots(maze_spec(u), len(trials), THREADS)
+    trials = [SimpleNamespace(u=u, reward=kind, samples=samples, planned=planned, trial=n, plans=[], time=0)
+              for kind, samples, planned in dict.fromkeys(cases) for n in range(u.trials)]
+    robots = common.Robots(maze_spec(u), len(trials), THREADS)  # an unstable one starts anew at the origin
     for first in range(0, len(trials), u.trials):  # every case has the same starts
         robots.reset(np.arange(first, first + u.trials), np.random.default_rng(u.seed))
     robots.qpos[:, :2] += u.start
@@ -173,7 +167,7 @@ def run(u):
             clock = time.perf_counter()
             horizon = min(t.planned, skills - i)  # no plan looks beyond the end of the episode
             z, path = plan(u, t.reward, t.samples, horizon, pool, s0)       # lines 2 to 12
-            t.seconds += time.perf_counter() - clock
+            t.time += time.perf_counter() - clock
             t.plans.append((len(poses) - 1, path.numpy()))
             chosen.append(z)
         commands = commands_of(u.policy, torch.stack(chosen), u.length)     # lines 17 and 18
@@ -190,7 +184,7 @@ def run(u):
             maze=u.maze, reward=t.reward, method=u.method, mode=u.mode, look_ahead=t.planned * skill_steps,
             samples=t.samples, trial=t.trial, seed=u.seed, final_distance=distance[-1],
             min_distance=distance.min(), success=int(distance[-1] < u.epsilon), contacts=contacts[n],
-            path_length=length, planning_ms=1e3 * t.seconds / skills, policy_seed=u.policy_seed,
+            path_length=length, planning_ms=1e3 * t.time / skills, policy_seed=u.policy_seed,
             policy=u.policy.sha256[:8], settings=u.settings))
     return rows, [t for t in trials if t.trial < 3]
 
@@ -323,8 +317,8 @@ def drive(u):
                 trail.append(robots.place()[0])
                 error = (ahead.pop(0) - trail[-1]).norm()
                 hand.text = f"mean command {c.norm(dim=2).mean():.2f}, tracking error {error:.2f} m"
-                hand.geoms = [dot(p, 0.8, 0.4, 0, 1) for p in trail[::10][-200:]]  # orange
-                hand.geoms += [dot(p, 0, 0.4, 0.7, 1) for p in ahead[::10]]  # blue
+                hand.geoms = ([dot(p, 0.8, 0.4, 0, 1) for p in trail[::10][-200:]]  # orange
+                              + [dot(p, 0, 0.4, 0.7, 1) for p in ahead[::10]])  # blue
                 data.qpos[:] = robots.qpos[0]
                 handle.sync()
                 steps += 1
@@ -386,8 +380,7 @@ def units_of(config, given):
             title = f"{method} {mode}, {maze}, {shared.policy} seed {seed}"
             name = common.artifact_name("policy", shared.policy, seed)
             if not any((folder / name).exists() for folder in (Path(OUT), common.HERE / "pretrained")):
-                print(f"{title} is left out: no {name}; make it with: python 03_train_policy.py "
-                      f"--experiment {shared.policy} --seed {seed}")
+                print(f"{title} is left out: no {name}; 03_train_policy.py --experiment {shared.policy} makes it")
                 continue
             policy = load_once(OUT, shared.policy, seed)
             if policy.robot != "ant" or mode == "closed" and isinstance(policy.decoder, common.SkillDynamics):
@@ -416,10 +409,9 @@ def draw_fig03(rows, units, examples):
     """Fig 3: trajectory scaling, on a trial's first plan: the same shape, H_z times as large."""
     u, path = examples[0].u, examples[0].plans[0][1]
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.2))
-    titles = f"predicted, $T$ = {u.length} a skill", f"scaled by $H_z$ = {u.hold}"
-    for ax, title, shrink in zip(axes, titles, (u.hold, 1)):
+    for ax, scale, title in zip(axes, (1, u.hold), ("predicted", f"scaled by $H_z$ = {u.hold}")):
         for first in range(0, len(path) - 1, u.length):
-            ax.plot(*((path[first:first + u.length + 1] - path[0]) / shrink).T, ".-")
+            ax.plot(*((path[first:first + u.length + 1] - path[0]) * scale / u.hold).T, ".-")
         ax.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=title)
     common.save_figure(figure, OUT, "fig03_trajectory_scaling")
 
@@ -445,12 +437,11 @@ def draw_fig07(rows, units, examples):
             for row in rows:
                 if (row["maze"], row["reward"], row["method"], row["mode"]) == panel + curve:
                     ends.setdefault(int(row["samples"]), []).append(float(row["final_distance"]))
-            values, colour = np.array([*ends.values()]), colours[n % 6]
-            ax.fill_between([*ends], *np.quantile(values, [0.25, 0.75], axis=1), color=colour, alpha=0.1)
-            ax.plot([*ends], values.mean(1), marker="osD^vP"[n % 6], color=colour, label=", ".join(curve))
-        ax.set(xscale="log", xlabel="N, samples per plan", ylim=(0, None), title=", ".join(panel))
-    axes[0, 0].set_ylabel("final distance (m)")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
+            sizes, values, colour = list(ends), np.array(list(ends.values())), colours[n % 6]
+            ax.fill_between(sizes, *np.quantile(values, [0.25, 0.75], axis=1), color=colour, alpha=0.1)
+            ax.plot(sizes, values.mean(1), marker="osD^vP"[n % 6], color=colour, label=", ".join(curve))
+        ax.set(xscale="log", xlabel="N", ylabel="final distance (m)", ylim=(0, None), title=", ".join(panel))
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=6)
     common.save_figure(figure, OUT, "fig07_planning")
 
 
@@ -459,16 +450,16 @@ def draw_examples(name, kind, rows, units, examples):
     shown = [example for example in examples if example.reward == kind]
     if not shown:
         return
-    columns = min(3, shown[0].u.trials)
-    rows = len(shown) // columns
-    figure, axes = plt.subplots(rows, columns, figsize=(3.6 * columns, 2.4 * rows), squeeze=False)
+    wide = min(3, shown[0].u.trials)
+    high = len(shown) // wide
+    figure, axes = plt.subplots(high, wide, figsize=(3.6 * wide, 2.4 * high), squeeze=False)
     for ax, example in zip(axes.flat, shown):
         u, poses = example.u, example.poses
         draw_maze(ax, u, u.title)
         for first, path in example.plans:
-            skill, end = path[:u.length + 1], poses[first + u.hold * u.length, :2]
-            ax.plot(*skill.T, ".-", color=BLUE, ms=4)
-            ax.plot(*np.stack([skill[-1], end]).T, "--", color=GREY, lw=1.2)
+            ends = np.stack([path[u.length], poses[first + u.hold * u.length, :2]])
+            ax.plot(*ends.T, "--", color=GREY, lw=1.2)
+            ax.plot(*path[:u.length + 1].T, ".-", color=BLUE, ms=4)
         ax.plot(*poses[:, :2].T, color=RED, lw=1.2)
     common.save_figure(figure, OUT, name)
 
@@ -488,7 +479,7 @@ def draw_gif(rows, units, examples):
         model.vis.global_.azimuth, model.vis.global_.elevation = 90, -65
         model.stat.extent *= 0.37  # the camera stands near enough for the walls to fill the picture
         data = mujoco.MjData(model)
-        for pose in example.poses[::6]:
+        for pose in example.poses[::8]:
             data.qpos[:] = pose
             mujoco.mj_forward(model, data)
             renderer.update_scene(data)
