@@ -380,7 +380,7 @@ def units_of(config, given):
             title = f"{method} {mode}, {maze}, {shared.policy} seed {seed}"
             name = common.artifact_name("policy", shared.policy, seed)
             if not any((folder / name).exists() for folder in (Path(OUT), common.HERE / "pretrained")):
-                print(f"{title} is left out: no {name}; 03_train_policy.py --experiment {shared.policy} makes it")
+                print(f"{title} is left out: no {name} of 03_train_policy.py --experiment {shared.policy}")
                 continue
             policy = load_once(OUT, shared.policy, seed)
             if policy.robot != "ant" or mode == "closed" and isinstance(policy.decoder, common.SkillDynamics):
@@ -440,13 +440,14 @@ def draw_fig07(rows, units, examples):
             sizes, values, colour = list(ends), np.array(list(ends.values())), colours[n % 6]
             ax.fill_between(sizes, *np.quantile(values, [0.25, 0.75], axis=1), color=colour, alpha=0.1)
             ax.plot(sizes, values.mean(1), marker="osD^vP"[n % 6], color=colour, label=", ".join(curve))
-        ax.set(xscale="log", xlabel="N", ylabel="final distance (m)", ylim=(0, None), title=", ".join(panel))
+        ax.set(xscale="log", xlabel="N", ylabel="final distance (m)", title=", ".join(panel))
+    ax.set_ylim(0)
     figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=6)
     common.save_figure(figure, OUT, "fig07_planning")
 
 
 def draw_examples(name, kind, rows, units, examples):
-    """Fig 8, 17, 18, a row per unit. Blue: predicted, orange: executed, dashed: the error of the end."""
+    """Fig 8, 17, 18: planned and executed paths, a row per unit."""
     shown = [example for example in examples if example.reward == kind]
     if not shown:
         return
@@ -461,6 +462,7 @@ def draw_examples(name, kind, rows, units, examples):
             ax.plot(*ends.T, "--", color=GREY, lw=1.2)
             ax.plot(*path[:u.length + 1].T, ".-", color=BLUE, ms=4)
         ax.plot(*poses[:, :2].T, color=RED, lw=1.2)
+    figure.supxlabel("blue: predicted, orange: executed, dashed: error of the end", fontsize=9)
     common.save_figure(figure, OUT, name)
 
 

@@ -23,20 +23,37 @@ CLAIMS = {  # words -> (better, its N, worse, its N)
 VERDICTS = ("holds", "undecided", "does not hold")
 
 
-def comparisons(rows, stage):
+def values_of(rows, column, **where):
+    """A column of the rows that agree with where: (policies, trials), empty if there are none."""
+    found = {}
+    for row in rows:
+        if all(row[name] == str(value) for name, value in where.items()):
+            found.setdefault(row["policy_seed"], []).append(float(row[column]))
+    return np.array(list(found.values()))
+
+
+def resampled_means(values, rng, draws=10_000):
+    """Means (draws,) of values (policies, trials), policies and trials of each drawn with replacement (the hierarchical
+    bootstrap): trials of one policy alone say nothing about the next policy."""
+    policies, trials = values.shape
+    drawn = rng.integers(policies, size=(draws, policies, 1))
+    return values[drawn, rng.integers(trials, size=(draws, policies, trials))].mean((1, 2))
+
+
+def comparisons(rows):
     """Every comparison of each claim in each panel of Fig 7, as rows: by how many metres the better method ends nearer,
     with its 95 % interval over policies and trials. It holds if all of that is above 0, does not hold if all is below.
     mode is that of the better method; the worse one is as printed."""
     rng, found = np.random.default_rng(0), []
     panels = dict.fromkeys((row["maze"], row["reward"]) for row in rows)
-    for words, mode, (maze, kind) in product(CLAIMS, stage.MODE_WORDS, panels):
+    for words, mode, (maze, kind) in product(CLAIMS, ("printed", "closed"), panels):
         for better, n_better, worse, n_worse in CLAIMS[words]:
             panel = dict(column="final_distance", maze=maze, reward=kind)
-            a = stage.values_of(rows, method=better, samples=n_better, mode=mode, **panel)
-            b = stage.values_of(rows, method=worse, samples=n_worse, mode="printed", **panel)
+            a = values_of(rows, method=better, samples=n_better, mode=mode, **panel)
+            b = values_of(rows, method=worse, samples=n_worse, mode="printed", **panel)
             if not (a.size and b.size):
                 continue
-            gain = stage.resampled_means(b, rng) - stage.resampled_means(a, rng)
+            gain = resampled_means(b, rng) - resampled_means(a, rng)
             low, high = np.quantile(gain, [0.025, 0.975])
             verdict = "undecided"
             if low > 0:
@@ -72,7 +89,7 @@ def main(stage):
     path = folder / f"{stage.EXPERIMENT}.csv"
     if not path.exists():
         common.stop(f"no {path}; make it with: python 04_mpc_maze.py --experiment figure7")
-    found = comparisons([row for row in common.read_csv(path) if row.get("settings") in present], stage)
+    found = comparisons([row for row in common.read_csv(path) if row.get("settings") in present])
     if not found:
         common.stop(f"{path} holds nothing to compare with the present settings")
     common.update_csv(folder / "claims.csv", found, tuple(found[0])[:8])
