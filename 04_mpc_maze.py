@@ -45,8 +45,7 @@ HOLD = 40                   # H_z, environment steps for which z_single is held
 LENGTH = 5                  # T, transitions of a skill
 PLANNED_DENSE = 3           # H_P, skills planned ahead, dense reward
 PLANNED_SPARSE = 3          # H_P, sparse reward: to the end of the episode
-Z_RANGE = 1.5               # skills ~ U(-Z_RANGE, Z_RANGE)
-FAST_ONLY = True            # but speed ~ U(0, Z_RANGE): slow is useless here (the paper's axis: -1.5 .. 0)
+Z_RANGE = 1.5               # skills ~ U(-Z_RANGE, Z_RANGE), but speed ~ U(0, Z_RANGE): slow is useless here
 
 # Planning, App. A.1.4
 SAMPLES = "1000"            # N, sequences of skills per plan; one or more numbers
@@ -56,8 +55,7 @@ PENALTY = 100.0             # w_p, for each transition of a plan that collides
 REWARD = 5.0                # w_r, sparse reward
 EPSILON = 5.0               # epsilon, metres: acceptable error; a trial that ends nearer is a success
 RADIUS = 1.0                # metres by which the planner grows the walls: the reach of the Ant's legs
-START = (0.0, 0.0)          # x and y, metres
-GOAL = (24.0, 12.0)         # 26.8 m away, 36 m along the axes
+GOAL = (24.0, 12.0)         # x and y, metres; the Ant starts at (0, 0), 26.8 m away, 36 m along the axes
 
 METHODS = {  # Table 2; a row wins over a maze's, or a maze would give a scale to WEDIS-NTS
     "wedis": {},
@@ -65,9 +63,9 @@ METHODS = {  # Table 2; a row wins over a maze's, or a maze would give a scale t
     "wedis_nts": dict(MODES="printed", HOLD=1, LENGTH=20, PLANNED_DENSE=4, PLANNED_SPARSE=30),  # no scaling
     # App. A.1.4 gives DADS U(-1, 1), as it is trained, and SeCTAR U(-1.5, 1.5); Table 2 swaps the two.
     "dads": dict(MODES="printed", POLICY="ant_dads", EPISODE=300, HOLD=20, LENGTH=1, PLANNED_DENSE=4,
-                 PLANNED_SPARSE=15, Z_RANGE=1.0, FAST_ONLY=False),
+                 PLANNED_SPARSE=15, Z_RANGE=1.0),
     "sectar": dict(MODES="printed", POLICY="ant_sectar", HOLD=1, LENGTH=40, PLANNED_DENSE=4,
-                   PLANNED_SPARSE=15, FAST_ONLY=False),
+                   PLANNED_SPARSE=15),
 }
 EXPERIMENTS = {  # a row names the constants in which an experiment differs; its name is that of its CSV
     "mazes": {},
@@ -76,7 +74,6 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs; its
     "fig18": dict(MAZES="s_maze obstacles", REWARDS="dense", MODES="closed", POLICY_SEEDS="0 1 2",
                   DRAW="fig18"),  # 30 s
     "drive": dict(DRIVE=True, MAZES="open", MODES="closed"),
-    # all methods look equally far ahead
     "matched": dict(METHOD=" ".join(METHODS), POLICY_SEEDS="0 1 2", TRIALS=20, DRAW="", LOOK_AHEAD="200 600"),
 }
 HULL = [(-7, -6, -7, 19), (31, 32, -7, 19), (-7, 32, -7, -6), (-7, 32, 18, 19)]  # x0, x1, y0, y1, metres
@@ -101,7 +98,7 @@ def skill_pool(u):
     trajectory units. Printed: the decoder's mean for T free steps; closed: the commands."""
     high = torch.full((u.policy.decoder.arguments[0],), u.z_range)
     low = -high
-    if u.fast_only and "speed" in u.policy.names:
+    if "speed" in u.policy.names:  # the paper: U(-1.5, 0), for its axis points the other way
         low[u.policy.names.index("speed")] = 0
     z = low + (high - low) * torch.rand(u.pool, len(low))
     if u.mode == "closed":
@@ -157,7 +154,6 @@ def run(u):
     robots = common.Robots(maze_spec(u), len(trials), THREADS)  # an unstable one starts anew at the origin
     for first in range(0, len(trials), u.trials):  # every case has the same starts
         robots.reset(np.arange(first, first + u.trials), np.random.default_rng(u.seed))
-    robots.qpos[:, :2] += u.start
     touch, contacts = robots.batch.bind("sensordata"), np.zeros(len(trials), int)
     torch.manual_seed(u.seed)
     pool, closed, poses = skill_pool(u), u.mode == "closed", [robots.qpos.copy()]
@@ -303,7 +299,6 @@ def drive(u):
                 if not ahead:  # a skill begins
                     if mode == "start again":
                         robots.reset([0])
-                        robots.qpos[0, :2] += u.start
                         trail = []
                     place, skill = robots.place()[0], torch.tensor([list(z.values())])
                     if mode == "plan to the goal" and left:
@@ -337,8 +332,8 @@ load_once = cache(common.load_policy)
 
 
 def words(text, name, allowed):
-    """The words of text. Exits with 2 if one is not allowed."""
-    for word in text.split():
+    """The words of text. Exits with 2 if there are none, or one is not allowed."""
+    for word in text.split() or [""]:
         if word not in allowed:
             stop(f"unknown {word!r} in --{name}; allowed: {' '.join(allowed)}")
     return text.split()
@@ -358,10 +353,10 @@ def settings(method, maze, config, given):
     u.modes = words(u.modes, "modes", ["printed", "closed"])
     u.rewards = words(u.rewards, "rewards", ["dense", "sparse"])
     for name in ("samples", "look_ahead", "policy_seeds"):
-        numbers = [common.convert(word, 1, False, f"{name} {of}") for word in values[name].split()]
+        numbers = [common.convert(word, 1, False, f"{name} {of}") for word in values[name].split() or ["0"]]
         setattr(u, name, numbers)
     for name in ("samples", "trials", "hold", "length", "planned_dense", "planned_sparse", "pool"):
-        if np.min(getattr(u, name), initial=1) < 1:
+        if np.min(getattr(u, name)) < 1:
             stop(f"{name} {of} is {values[name]}, but must be at least 1")
     if u.episode < u.hold * u.length:
         stop(f"an episode {of} has {u.episode} steps, but one skill {u.hold * u.length}")
@@ -373,7 +368,8 @@ def settings(method, maze, config, given):
 def units_of(config, given):
     """All units of a run. One without a policy is left out with a line; exits with 2 if none is left."""
     units = []
-    words(DRAW, "draw", DRAWINGS)
+    if DRAW:
+        words(DRAW, "draw", DRAWINGS)
     for method, maze in product(words(METHOD, "method", METHODS), words(MAZES, "mazes", MAZE)):
         shared = settings(method, maze, config, given)
         for mode, seed in product(shared.modes, shared.policy_seeds):
@@ -400,7 +396,7 @@ def units_of(config, given):
 def draw_maze(ax, u, title):
     for x0, x1, y0, y1 in u.walls:
         ax.add_patch(plt.Rectangle((x0, y0), x1 - x0, y1 - y0, color="#7a869a", lw=0))
-    ax.plot(*u.start, "o", ms=5, color="black")
+    ax.plot(0, 0, "o", ms=5, color="black")
     ax.plot(*u.goal, "o", ms=9, color=RED)
     ax.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=title)
 
