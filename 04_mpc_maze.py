@@ -433,9 +433,10 @@ def draw_fig07(rows, units, examples):
             for row in rows:
                 if (row["maze"], row["reward"], row["method"], row["mode"]) == panel + curve:
                     ends.setdefault(int(row["samples"]), []).append(float(row["final_distance"]))
-            sizes, values, colour = list(ends), np.array(list(ends.values())), colours[n % 6]
-            ax.fill_between(sizes, *np.quantile(values, [0.25, 0.75], axis=1), color=colour, alpha=0.1)
-            ax.plot(sizes, values.mean(1), marker="osD^vP"[n % 6], color=colour, label=", ".join(curve))
+            mean = [np.mean(values) for values in ends.values()]
+            half = np.reshape([np.quantile(values, [0.25, 0.75]) for values in ends.values()], (-1, 2))
+            ax.fill_between(list(ends), *half.T, color=colours[n % 6], alpha=0.1)
+            ax.plot(list(ends), mean, color=colours[n % 6], marker="osD^vP"[n % 6], label=", ".join(curve))
         ax.set(xscale="log", xlabel="N", ylabel="final distance (m)", title=", ".join(panel))
     ax.set_ylim(0)
     figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=6)
@@ -463,9 +464,9 @@ def draw_examples(name, kind, rows, units, examples):
 
 
 def draw_gif(rows, units, examples):
-    """A GIF per maze: trial 0 of the last reward and mode. Dots: where the Ant goes."""
-    shown = {example.u.maze: example for example in examples if example.trial == 0}  # the last of each maze
-    for maze, example in shown.items():
+    """A GIF per maze: trial 0 of its first reward in the last mode. Dots: where the Ant goes."""
+    firsts = [example for example in examples if (example.trial, example.reward) == (0, example.u.rewards[0])]
+    for maze, example in {example.u.maze: example for example in firsts}.items():
         frames, spec = [], maze_spec(example.u)
         for x, y in example.poses[::10, :2]:
             spec.worldbody.add_site(pos=[x, y, 0], size=[0.15, 0.15, 0.15], rgba=[0, 0.45, 0.7, 1])
