@@ -1,20 +1,14 @@
 """Stage 4: decoder + policy -> mazes solved without training in them (Sec. 5, Algorithm 2, Sec. 6.2).
 
 In: policy_<POLICY>_seed<n>.pt of stage 3. Out: <OUT>/results/<EXPERIMENT>.csv, a row per trial, and figures.
-  python 04_mpc_maze.py                         Fig 3, 6, 8, 17, GIFs, mazes.csv          100 s on two cores
-  python 04_mpc_maze.py --experiment figure7    Fig 7; resumes
-  python 04_mpc_maze.py --experiment fig18      Fig 18: S-maze and obstacles              30 s
-  python 04_mpc_maze.py --experiment matched    all methods look equally far; resumes
-  python 04_mpc_maze.py --experiment drive      a page with a slider for each axis of z
-(The cores were busy with a training, too.) Expect, n = 1 policy (seed 0) and 50 trials, mean final distances
-of 2.9 m and 2.4 m (mazes 1 and 2, dense), 4.4 m and 4.5 m (sparse) as printed; 1.5, 0.7, 3.5, 3.4 m in closed
-loop. The start is 26.8 m from the goal.
+  python 04_mpc_maze.py                          Fig 3, 6, 8, 17 and GIFs, 100 s on two cores
+  python 04_mpc_maze.py --experiment figure7     or another row of EXPERIMENTS below
+Expect, of policy seed 0 and 50 trials, mean final distances of 2.9 and 2.4 m (mazes 1 and 2, dense), 4.4 and
+4.5 m (sparse) as printed; 1.5, 0.7, 3.5, 3.4 m in closed loop. The start is 26.8 m from the goal.
 """
 import hashlib
 import io
-import json
 import logging
-import math
 import time
 from functools import cache, partial
 from itertools import product
@@ -26,14 +20,16 @@ from common import BLUE, GREY, RED, commands_of, execute, plt, stop
 import mujoco
 import numpy as np
 import torch
-from matplotlib.colors import to_rgb
 from PIL import Image  # comes with matplotlib
 
 EXPERIMENT = "mazes"        # row of EXPERIMENTS below
 SEED = 0                    # random seed of the trials
 OUT = "runs"                # folder that everything is written to
 THREADS = 2                 # CPU threads
-DRAW = "fig03 fig06 fig08 fig17 gif"  # what is made of the trials; also fig07 fig18
+DRAW = "fig03 fig06 fig08 fig17 gif"  # rows of DRAWINGS below
+DRIVE = False               # true: plan nothing, serve a page with a slider for each axis of z
+SECONDS = 0.0               # until the page ends by itself; 0: when it is closed
+PORT = 8080                 # of the page, on this machine alone; 0: the first free one
 
 METHOD = "wedis"            # rows of METHODS below
 MAZES = "maze1 maze2"       # rows of MAZE below
@@ -49,24 +45,17 @@ HOLD = 40                   # H_z, environment steps for which z_single is held
 LENGTH = 5                  # T, transitions of a skill
 PLANNED_DENSE = 3           # H_P, skills planned ahead, dense reward
 PLANNED_SPARSE = 3          # H_P, sparse reward: to the end of the episode
-Z_RANGE = 1.5               # skills ~ U(-Z_RANGE, Z_RANGE)
-FAST_ONLY = True            # but speed ~ U(0, Z_RANGE): slow is useless here (the paper's axis: -1.5 .. 0)
+Z_RANGE = 1.5               # skills ~ U(-Z_RANGE, Z_RANGE), but speed ~ U(0, Z_RANGE): slow is useless here
 
 # Planning, App. A.1.4
 SAMPLES = "1000"            # N, sequences of skills per plan; one or more numbers
-LOOK_AHEAD = ""             # steps to plan ahead in place of Table 2's H_P; one or more numbers, or none
+LOOK_AHEAD = "0"            # steps to plan ahead, one or more numbers; 0: Table 2's H_P
 POOL = 65536                # skills are drawn from so many, decoded once (the paper does not say)
 PENALTY = 100.0             # w_p, for each transition of a plan that collides
 REWARD = 5.0                # w_r, sparse reward
 EPSILON = 5.0               # epsilon, metres: acceptable error; a trial that ends nearer is a success
 RADIUS = 1.0                # metres by which the planner grows the walls: the reach of the Ant's legs
-START = (0.0, 0.0)          # x and y, metres
-GOAL = (24.0, 12.0)         # 26.8 m away, 36 m along the axes
-
-# Driving by hand
-DRIVE = False               # true: plan nothing, serve a page with a slider for each axis of z
-SECONDS = 0.0               # until it ends by itself; 0: when the page is closed
-PORT = 8080                 # of the page, on this machine alone; 0: the first free one
+GOAL = (24.0, 12.0)         # x and y, metres; the Ant starts at (0, 0), 26.8 m away, 36 m along the axes
 
 METHODS = {  # Table 2; a row wins over a maze's, or a maze would give a scale to WEDIS-NTS
     "wedis": {},
@@ -74,16 +63,16 @@ METHODS = {  # Table 2; a row wins over a maze's, or a maze would give a scale t
     "wedis_nts": dict(MODES="printed", HOLD=1, LENGTH=20, PLANNED_DENSE=4, PLANNED_SPARSE=30),  # no scaling
     # App. A.1.4 gives DADS U(-1, 1), as it is trained, and SeCTAR U(-1.5, 1.5); Table 2 swaps the two.
     "dads": dict(MODES="printed", POLICY="ant_dads", EPISODE=300, HOLD=20, LENGTH=1, PLANNED_DENSE=4,
-                 PLANNED_SPARSE=15, Z_RANGE=1.0, FAST_ONLY=False),
+                 PLANNED_SPARSE=15, Z_RANGE=1.0),
     "sectar": dict(MODES="printed", POLICY="ant_sectar", HOLD=1, LENGTH=40, PLANNED_DENSE=4,
-                   PLANNED_SPARSE=15, FAST_ONLY=False),
+                   PLANNED_SPARSE=15),
 }
 EXPERIMENTS = {  # a row names the constants in which an experiment differs; its name is that of its CSV
     "mazes": {},
     "figure7": dict(METHOD=" ".join(METHODS), POLICY_SEEDS="0 1 2", TRIALS=20, DRAW="fig07",
-                    SAMPLES="10 30 100 300 1000 3000"),
+                    SAMPLES="10 30 100 300 1000 3000"),  # stopped and started again, it resumes
     "fig18": dict(MAZES="s_maze obstacles", REWARDS="dense", MODES="closed", POLICY_SEEDS="0 1 2",
-                  DRAW="fig18"),
+                  DRAW="fig18"),  # 30 s
     "drive": dict(DRIVE=True, MAZES="open", MODES="closed"),
     "matched": dict(METHOD=" ".join(METHODS), POLICY_SEEDS="0 1 2", TRIALS=20, DRAW="", LOOK_AHEAD="200 600"),
 }
@@ -105,11 +94,11 @@ MAZE = {  # walls, and the constants in which a maze differs; plan a row of your
 # flags. All its cases (reward, N, H_P) with all their trials run in one simulation.
 
 def skill_pool(u):
-    """The skills that plans draw from, decoded once: z (POOL, M), and the displacements that they predict
-    (POOL, T, 2), trajectory units. Printed: the decoder's mean for T free steps; closed: the commands."""
+    """The skills that plans draw from: z (POOL, M), and the displacements that they predict (POOL, T, 2),
+    trajectory units. Printed: the decoder's mean for T free steps; closed: the commands."""
     high = torch.full((u.policy.decoder.arguments[0],), u.z_range)
     low = -high
-    if u.fast_only and "speed" in u.policy.names:
+    if "speed" in u.policy.names:  # the paper: U(-1.5, 0), for its axis points the other way
         low[u.policy.names.index("speed")] = 0
     z = low + (high - low) * torch.rand(u.pool, len(low))
     if u.mode == "closed":
@@ -150,80 +139,75 @@ def plan(u, kind, samples, horizon, pool, s0):
 
 
 def run(u):
-    """Algorithm 2 for all cases and trials of a unit. Returns rows for the CSV and, for figures, of trials 0
-    to 2 of each case the poses (steps + 1, nq) and for each decision its step and its path (H_P T + 1, 2).
-    A robot that MuJoCo finds unstable starts anew at the origin, and its trial counts where it ends."""
-    skills = u.episode // (u.hold * u.length)
-    ahead = [max(1, steps // (u.hold * u.length)) for steps in u.look_ahead]
-    cases = list(dict.fromkeys(
-        (kind, samples, min(planned, skills)) for kind, samples in product(u.rewards, u.samples)
-        for planned in ahead or [dict(dense=u.planned_dense, sparse=u.planned_sparse)[kind]]))
-    trials = list(product(cases, range(u.trials)))
-    robots = common.Robots(maze_spec(u), len(trials), THREADS)
-    for ids in np.arange(len(trials)).reshape(len(cases), -1):  # every case has the same starts
-        robots.reset(ids, np.random.default_rng(u.seed))
-    robots.qpos[:, :2] += u.start
-    touch = robots.batch.bind("sensordata")
+    """Algorithm 2 for all cases and trials of a unit. Returns rows for the CSV and, for figures, trials 0 to
+    2 of each case with their poses (steps + 1, nq) and for each decision its step and path (H_P T + 1, 2)."""
+    skill_steps = u.hold * u.length
+    skills = u.episode // skill_steps
+    cases = []
+    for kind, samples, steps in product(u.rewards, u.samples, u.look_ahead):
+        planned = u.planned_sparse if kind == "sparse" else u.planned_dense
+        if steps:
+            planned = max(1, steps // skill_steps)
+        cases.append((kind, samples, min(planned, skills)))
+    trials = [SimpleNamespace(u=u, reward=kind, samples=samples, planned=planned, trial=n, plans=[], time=0)
+              for kind, samples, planned in dict.fromkeys(cases) for n in range(u.trials)]
+    robots = common.Robots(maze_spec(u), len(trials), THREADS)  # an unstable one starts anew at the origin
+    for first in range(0, len(trials), u.trials):  # every case has the same starts
+        robots.reset(np.arange(first, first + u.trials), np.random.default_rng(u.seed))
+    touch, contacts = robots.batch.bind("sensordata"), np.zeros(len(trials), int)
     torch.manual_seed(u.seed)
-    pool, closed = skill_pool(u), u.mode == "closed"
-    poses, plans = [robots.qpos.copy()], [[] for _ in trials]
-    contacts, seconds = np.zeros(len(trials), int), np.zeros(len(trials))
+    pool, closed, poses = skill_pool(u), u.mode == "closed", [robots.qpos.copy()]
     for i in range(skills):                                                 # line 1
         chosen = []
-        for n, ((kind, samples, planned), _) in enumerate(trials):
+        for t, s0 in zip(trials, robots.place()):
             clock = time.perf_counter()
-            horizon = min(planned, skills - i)  # no plan looks beyond the end of the episode
-            z, path = plan(u, kind, samples, horizon, pool, robots.place()[n])  # lines 2 to 12
-            seconds[n] += time.perf_counter() - clock
+            horizon = min(t.planned, skills - i)  # no plan looks beyond the end of the episode
+            z, path = plan(u, t.reward, t.samples, horizon, pool, s0)       # lines 2 to 12
+            t.time += time.perf_counter() - clock
+            t.plans.append((len(poses) - 1, path.numpy()))
             chosen.append(z)
-            plans[n].append((len(poses) - 1, path.numpy()))
         commands = commands_of(u.policy, torch.stack(chosen), u.length)     # lines 17 and 18
         for _ in execute(u.policy, robots, commands, u.hold, closed, deterministic=closed):  # lines 13 to 19
             contacts += touch[:, 0] > 0
             poses.append(robots.qpos.copy())                                # line 20
 
-    rows, examples = [], []
-    for n, ((kind, samples, planned), trial) in enumerate(trials):
-        pose = np.stack([step[n] for step in poses])
-        distance = np.linalg.norm(pose[:, :2] - u.goal, axis=1)
+    rows = []
+    for n, t in enumerate(trials):
+        t.poses = np.stack([pose[n] for pose in poses])
+        distance = np.linalg.norm(t.poses[:, :2] - u.goal, axis=1)
+        length = np.linalg.norm(np.diff(t.poses[:, :2], axis=0), axis=1).sum()
         rows.append(dict(
-            maze=u.maze, reward=kind, method=u.method, mode=u.mode,
-            look_ahead=planned * u.hold * u.length, samples=samples, trial=trial, seed=u.seed,
-            final_distance=distance[-1], min_distance=distance.min(), success=int(distance[-1] < u.epsilon),
-            contacts=contacts[n], path_length=np.linalg.norm(np.diff(pose[:, :2], axis=0), axis=1).sum(),
-            planning_ms=1e3 * seconds[n] / skills, policy_seed=u.policy_seed, policy=u.policy.sha256[:8],
-            settings=u.settings))
-        if trial < 3:
-            examples.append(SimpleNamespace(u=u, trial=trial, reward=kind, poses=pose, plans=plans[n]))
-    return rows, examples
+            maze=u.maze, reward=t.reward, method=u.method, mode=u.mode, look_ahead=t.planned * skill_steps,
+            samples=t.samples, trial=t.trial, seed=u.seed, final_distance=distance[-1],
+            min_distance=distance.min(), success=int(distance[-1] < u.epsilon), contacts=contacts[n],
+            path_length=length, planning_ms=1e3 * t.time / skills, policy_seed=u.policy_seed,
+            policy=u.policy.sha256[:8], settings=u.settings))
+    return rows, [t for t in trials if t.trial < 3]
 
 
 def main():
     units = units_of(*common.parse_flags(globals()))
-    if THREADS < 1:
-        stop("--threads must be at least 1")
     torch.set_num_threads(1)  # tensors are small here; THREADS are for the physics
     if DRIVE:
         return drive(units[0])
-    path, start, examples = Path(OUT) / "results" / f"{EXPERIMENT}.csv", time.time(), []
+    path, start, examples, done = Path(OUT) / "results" / f"{EXPERIMENT}.csv", time.time(), [], set()
+    if path.exists() and not NEED_PATHS & set(DRAW.split()):
+        done = {row.get("settings") for row in common.read_csv(path)}
     for u in units:
-        what = f"{u.method} {MODE_WORDS[u.mode]}, {u.maze}, policy seed {u.policy_seed}"
-        done = common.read_csv(path) if path.exists() and not NEED_PATHS & set(DRAW.split()) else []
-        if any(row.get("settings") == u.settings for row in done):
-            print(f"{what}: in {path} already, with the same policy and settings")
+        if u.settings in done:
+            print(f"{u.title}: in {path} already, with the same settings")
             continue
         rows, found = run(u)
         common.update_csv(path, rows, ("maze", "method", "mode", "seed", "policy_seed"))
         examples += found
-        print(f"{time.time() - start:4.0f} s  {what}", flush=True)
+        print(f"{time.time() - start:4.0f} s  {u.title}", flush=True)
     present = {u.settings for u in units}
     rows = [row for row in common.read_csv(path) if row.get("settings") in present]
-    print(f"wrote {path}\n\n{table(rows, units)}\n")
+    print(f"wrote {path}; mean distance to the goal at the end, and share of trials that end nearer than epsilon:")
+    print_table(rows)
     for name in DRAW.split():
         DRAWINGS[name](rows, units, examples)
 
-
-# ---------------------------------------------------------------- the maze
 
 def maze_spec(u):
     """The Ant between real walls 1 m high, a sensor of their contacts, and the goal as a red disc."""
@@ -258,19 +242,20 @@ def collides(path, walls, radius):
 
 # ---------------------------------------------------------------- driving by hand: not in the paper
 
-def dot(place, colour):
-    """A ball on the floor at place (2,), metres, for MuJoCo's renderers."""
+def dot(place, *colour):
+    """A ball on the floor at place (2,), metres, for MuJoCo's viewer."""
     geom = mujoco.MjvGeom()
     mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.1), np.array([*place, 0.1]),
-                        np.eye(3).ravel(), np.float32([*to_rgb(colour), 1]))
+                        np.eye(3).ravel(), np.float32(colour))
     return geom
 
 
 def drive(u):
     """Sliders in a web page command the Ant in real time. mujoco serves the page, to this machine alone."""
-    robots, data, pages, steps = common.Robots(maze_spec(u), 1), mujoco.MjData(maze_spec(u).compile()), [], 0
-    z, pool, start = {"z_" + name: 0.0 for name in u.policy.names}, skill_pool(u), time.monotonic()
-    hand = SimpleNamespace(mode="start again", z=z, closed=True, text="", geoms=[])  # both threads use it
+    robots, data, pool = common.Robots(maze_spec(u), 1), mujoco.MjData(maze_spec(u).compile()), skill_pool(u)
+    hand = SimpleNamespace(mode="start again", closed=True, text="", geoms=[],  # both threads use it
+                           z={"z_" + name: 0.0 for name in u.policy.names})
+    asked, steps, start, pages = None, 0, time.monotonic(), []
     try:
         from mujoco.studio import launch_web, messages, plugin, viewer_protocol, web_viewer
         from mujoco.studio.dear_imgui import dear_imgui as gui
@@ -289,8 +274,9 @@ def drive(u):
                 z = {name: gui.SliderFloat(name, at, -1.5, 1.5, "%.2f")[1] for name, at in hand.z.items()}
                 if z != hand.z:
                     hand.z, hand.mode = z, "by hand"
-                modes = [m for m in ("stand still", "start again", "plan to the goal") if gui.Button(m)]
-                hand.mode = modes[0] if modes else hand.mode
+                for mode in ("stand still", "start again", "plan to the goal"):
+                    if gui.Button(mode):
+                        hand.mode = mode
                 hand.closed = gui.Checkbox("closed loop", hand.closed)[1]
                 gui.TextUnformatted(hand.text)
                 gui.End()
@@ -305,31 +291,30 @@ def drive(u):
             while handle.is_running() and not 0 < SECONDS <= time.monotonic() - start:
                 if pages and "(0 total)" in pages[-1].getMessage() and time.time() > pages[-1].created + 10:
                     break  # the last page is closed; one that reloads is back sooner
-                if hand.mode == "start again":
-                    hand.mode, asked, age, trail = "stand still", None, 0, []
-                    robots.reset([0])
-                    robots.qpos[0, :2] += u.start
-                place, mode, z = robots.place()[0], hand.mode, hand.z  # once: the page changes them
-                if asked != (mode, z):
-                    left, age = u.planned_dense, u.hold * u.length
-                if left == 0 and age == u.hold * u.length:  # the last planned skill is over
-                    mode = hand.mode = "stand still"
-                if age == u.hold * u.length:
-                    asked, age, reference, going = (mode, z), 0, place, mode != "stand still"
-                    skill = torch.tensor([list(z.values())])
-                    if mode == "plan to the goal":
+                mode, z, closed = hand.mode, hand.z, hand.closed
+                if asked != (mode, z, closed):
+                    asked, left, ahead = (mode, z, closed), u.planned_dense, []
+                if not ahead:  # a skill begins
+                    if mode == "start again":
+                        robots.reset([0])
+                        trail = []
+                    place, skill = robots.place()[0], torch.tensor([list(z.values())])
+                    if mode == "plan to the goal" and left:
                         skill, left = plan(u, "dense", u.samples[0], left, pool, place)[0][None], left - 1
-                    c = going * commands_of(u.policy, skill, u.length)[0].repeat_interleave(u.hold, 0)
-                command = common.closed_loop(c[age][None], reference[None], robots, u.policy.scale)
-                command = command if hand.closed else c[age][None]
-                robots.step(u.policy.actor.act(robots.observe(), command, deterministic=True).numpy())
-                hand.text = f"command {command.norm():.2f}, tracking error {(reference - place).norm():.2f} m"
-                age, steps, reference = age + 1, steps + 1, reference + u.policy.scale * c[age]
-                trail.append(place)
-                ahead = place + u.policy.scale * c.roll(-age, 0).cumsum(0)  # the skill is repeated
-                hand.geoms = [dot(p, RED) for p in trail[::10][-200:]] + [dot(p, BLUE) for p in ahead[::10]]
+                    elif mode != "by hand":
+                        mode = hand.mode = "stand still"
+                    c = commands_of(u.policy, skill, u.length) * (mode != "stand still")
+                    skill_steps = execute(u.policy, robots, c, u.hold, closed, deterministic=True)
+                    ahead = list(place + u.policy.scale * c[0].repeat_interleave(u.hold, 0).cumsum(0))
+                next(skill_steps)
+                trail.append(robots.place()[0])
+                error = (ahead.pop(0) - trail[-1]).norm()
+                hand.text = f"mean command {c.norm(dim=2).mean():.2f}, tracking error {error:.2f} m"
+                hand.geoms = ([dot(p, 0.8, 0.4, 0, 1) for p in trail[::10][-200:]]  # orange
+                              + [dot(p, 0, 0.4, 0.7, 1) for p in ahead[::10]])  # blue
                 data.qpos[:] = robots.qpos[0]
                 handle.sync()
+                steps += 1
                 time.sleep(max(0, start + 0.05 * steps - time.monotonic()))
     except KeyboardInterrupt:
         pass
@@ -340,69 +325,65 @@ def drive(u):
 
 # ---------------------------------------------------------------- what is planned: rows, flags, checks
 
-MODE_WORDS = dict(printed="as printed", closed="closed loop")
 OF_A_RUN = "EXPERIMENT OUT THREADS DRAW METHOD MAZES DRIVE SECONDS PORT".split()  # no other row sets these
-load_once, print_once = cache(common.load_policy), cache(print)
+load_once = cache(common.load_policy)
 
 
-def listed(text, name, allowed):
-    """The parts of text, each once: names in the table allowed, or whole numbers from the int allowed on."""
-    parts, numbers = list(dict.fromkeys(text.split())), isinstance(allowed, int)
-    for part in parts:
-        if numbers and not (part.isdecimal() and int(part) >= allowed):
-            stop(f"unknown {part!r} in --{name}; allowed: whole numbers from {allowed}")
-        if not numbers and part not in allowed:
-            stop(f"unknown {part!r} in --{name}; allowed: {' '.join(allowed)}")
-    return [int(part) for part in parts] if numbers else parts
+def words(text, name, allowed):
+    """The words of text. Exits with 2 if there are none, or one is not allowed."""
+    for word in text.split() or [""]:
+        if word not in allowed:
+            stop(f"unknown {word!r} in --{name}; allowed: {' '.join(allowed)}")
+    return text.split()
 
 
 def settings(method, maze, config, given):
     """The constants of a method in a maze: those of the file and EXPERIMENTS (config), over them MAZE's row,
     over it METHODS' row, over all the flags (given). Exits with 2 and one line if they make no sense."""
-    rows, of = MAZE[maze] | METHODS[method], f"in the row {maze!r} or {method!r}"
+    rows, of = MAZE[maze] | METHODS[method], f"of {method} in {maze}"
     walls = rows.pop("WALLS", [])
     for name, value in rows.items():
         if name not in config or name in OF_A_RUN:
-            stop(f"{name} {of} is no constant that it may set")
+            stop(f"{name} {of} is no constant that a row may set")
         rows[name] = common.convert(value, config[name], f"{name} {of}")
     values = {name.lower(): value for name, value in (config | rows | given).items() if name not in OF_A_RUN}
     u = SimpleNamespace(**values | dict(method=method, maze=maze, walls=walls))
-    for name, allowed in dict(samples=1, look_ahead=1, policy_seeds=0, modes=MODE_WORDS,
-                              rewards=("dense", "sparse")).items():
-        setattr(u, name, listed(values[name], name, allowed))
-    for name in "trials hold length planned_dense planned_sparse pool".split():
-        if values[name] < 1:
-            stop(f"{method} in {maze}: {name} is {values[name]}, but must be at least 1")
+    u.modes = words(u.modes, "modes", ["printed", "closed"])
+    u.rewards = words(u.rewards, "rewards", ["dense", "sparse"])
+    for name in ("samples", "look_ahead", "policy_seeds"):
+        numbers = [common.convert(word, 1, f"{name} {of}") for word in values[name].split() or ["0"]]
+        setattr(u, name, numbers)
+    for name in ("samples", "trials", "hold", "length", "planned_dense", "planned_sparse", "pool"):
+        if np.min(getattr(u, name)) < 1:
+            stop(f"{name} {of} is {values[name]}, but must be at least 1")
     if u.episode < u.hold * u.length:
-        stop(f"{method} in {maze}: an episode has {u.episode} steps, but one skill {u.hold * u.length}")
+        stop(f"an episode {of} has {u.episode} steps, but one skill {u.hold * u.length}")
     if not all(len(wall) == 4 and wall[0] < wall[1] and wall[2] < wall[3] for wall in walls):
         stop(f"WALLS {of}: each is (x0, x1, y0, y1) in metres, with x0 < x1 and y0 < y1")
     return u
 
 
 def units_of(config, given):
-    """All units of a run. One that cannot run is left out with a line; exits with 2 if none is left."""
+    """All units of a run. One without a policy is left out with a line; exits with 2 if none is left."""
     units = []
-    listed(DRAW, "draw", DRAWINGS)
-    for method, maze in product(listed(METHOD, "method", METHODS), listed(MAZES, "mazes", MAZE)):
+    if DRAW:
+        words(DRAW, "draw", DRAWINGS)
+    for method, maze in product(words(METHOD, "method", METHODS), words(MAZES, "mazes", MAZE)):
         shared = settings(method, maze, config, given)
         for mode, seed in product(shared.modes, shared.policy_seeds):
-            u = SimpleNamespace(**vars(shared) | dict(mode=mode, modes="", policy_seed=seed, policy_seeds=""))
-            name = common.artifact_name("policy", u.policy, seed)
+            title = f"{method} {mode}, {maze}, {shared.policy} seed {seed}"
+            name = common.artifact_name("policy", shared.policy, seed)
             if not any((folder / name).exists() for folder in (Path(OUT), common.HERE / "pretrained")):
-                print_once(f"{method} is left out: no {name}; make it with: python 03_train_policy.py "
-                           f"--experiment {u.policy} --seed {seed}")
+                print(f"{title} is left out: no {name} of 03_train_policy.py --experiment {shared.policy}")
                 continue
-            policy = load_once(OUT, u.policy, seed)
+            policy = load_once(OUT, shared.policy, seed)
             if policy.robot != "ant" or mode == "closed" and isinstance(policy.decoder, common.SkillDynamics):
-                print_once(f"{method} {MODE_WORDS[mode]} is left out with {name}: the mazes are for the ant, "
-                           "and the closed loop is for commands that are displacements")
-                continue
-            if policy.method not in method:
-                print_once(f"note: {method} plans with {name}, which is trained by {policy.method}")
-            made_by = vars(u) | dict(policy=policy.sha256) | {
-                name: getattr(common, name) for name in ("FEEDBACK", "CORRECTION", "FASTEST", "SOFT_START")}
-            u.settings = hashlib.sha256(json.dumps(made_by, sort_keys=True).encode()).hexdigest()[:8]
+                stop(f"{title}: mazes are for the ant, the closed loop for commands that are displacements")
+            u = SimpleNamespace(**vars(shared) | dict(mode=mode, policy_seed=seed, title=title))
+            del u.modes, u.policy_seeds  # what else is planned changes no result
+            following = common.FEEDBACK, common.CORRECTION, common.FASTEST, common.SOFT_START
+            made_by = repr([sorted(vars(u).items()), policy.sha256, following])
+            u.settings = hashlib.sha256(made_by.encode()).hexdigest()[:8]
             u.policy = policy
             units.append(u)
     return units or stop("there is nothing to plan: choose --method, --mazes, --modes, --policy_seeds")
@@ -427,144 +408,112 @@ def resampled_means(values, rng, draws=10_000):
     return values[drawn, rng.integers(trials, size=(draws, policies, trials))].mean((1, 2))
 
 
-def table(rows, units):
-    """A line per maze and reward (and method, N, look-ahead if there are several); modes side by side."""
-    several = [name for name in ("method", "samples", "look_ahead") if len({row[name] for row in rows}) > 1]
-    columns, modes = ["maze", "reward", *several], dict.fromkeys(u.mode for u in units)
-    lines = [columns + [words for mode in modes for words in (MODE_WORDS[mode], "success")]]
-    lines.append(["---"] * len(lines[0]))
-    for key in dict.fromkeys(tuple(row[name] for name in columns) for row in rows):
-        lines.append([*key])
-        for mode in modes:
-            where = dict(zip(columns, key), mode=mode)
-            distance, success = (values_of(rows, name, **where) for name in ("final_distance", "success"))
-            lines[-1] += ["", ""]
-            if distance.size:
-                lines[-1][-2:] = f"{distance.mean():.1f} m", f"{100 * success.mean():.0f} %"
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + (
-        f"\nDistance to the goal at the end, mean of {units[0].trials} trials of each policy; success: it is "
-        f"less than {units[0].epsilon:g} m.")
-
-
-NAMES = dict(wedis="WEDIS", wedis_s="WEDIS-S", wedis_nts="WEDIS-NTS", dads="DADS", sectar="SeCTAR")
-COLOURS = [BLUE, RED, "#009E73", "#E69F00", "#CC79A7", "#56B4E9"] * 5  # Okabe-Ito
+def print_table(rows):
+    """A line per maze, reward, method, N and look-ahead, the modes side by side."""
+    lines = {}
+    for row in rows:
+        key = tuple(row[name] for name in ("maze", "reward", "method", "samples", "look_ahead"))
+        lines.setdefault(key, {}).setdefault(row["mode"], []).append(row)
+    for (maze, reward, method, samples, ahead), modes in lines.items():
+        print(f"{maze:10} {reward:7} {method:10} N {samples:>5}, {ahead:>3} steps ahead", end="")
+        for mode, found in modes.items():
+            distance, success = (np.mean([float(row[name]) for row in found])
+                                 for name in ("final_distance", "success"))
+            print(f" | {mode} {distance:4.1f} m {100 * success:3.0f} %", end="")
+        print()
 
 
 def draw_maze(ax, u, title):
     for x0, x1, y0, y1 in u.walls:
         ax.add_patch(plt.Rectangle((x0, y0), x1 - x0, y1 - y0, color="#7a869a", lw=0))
-    ax.plot(*u.start, "o", ms=5, color="black")
-    ax.plot(*u.goal, "x", color="black", ms=8, mew=2, label="goal")
-    ax.margins(0)
+    ax.plot(0, 0, "o", ms=5, color="black")
+    ax.plot(*u.goal, "o", ms=9, color=RED)
     ax.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=title)
-    ax.grid(False)
 
 
 def draw_fig03(rows, units, examples):
-    """Fig 3: trajectory scaling, on a trial's first plan. Left: T predicted steps a skill; right: scaled."""
+    """Fig 3: trajectory scaling, on a trial's first plan: the same shape, H_z times as large."""
     u, path = examples[0].u, examples[0].plans[0][1]
-    small = path[0] + (path - path[0]) / u.hold
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.2), width_ratios=(1, 1.6))
-    draw_maze(right, u, f"scaled by $H_z$ = {u.hold}")
-    for n, first in enumerate(range(0, len(path) - 1, u.length)):
-        for ax, points in ((left, small), (right, path)):
-            ax.plot(*points[first:first + u.length + 1].T, ".-", color=COLOURS[n], label=f"skill {n + 1}")
-    left.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"predicted, $T$ = {u.length} a skill")
-    left.legend(fontsize=8)
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2))
+    for ax, scale, title in zip(axes, (1, u.hold), ("predicted", f"scaled by $H_z$ = {u.hold}")):
+        for first in range(0, len(path) - 1, u.length):
+            ax.plot(*((path[first:first + u.length + 1] - path[0]) * scale / u.hold).T, ".-")
+        ax.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=title)
     common.save_figure(figure, OUT, "fig03_trajectory_scaling")
 
 
 def draw_fig06(rows, units, examples):
     """Fig 6: the navigation tasks, goals as red circles."""
-    mazes = {u.maze: u for u in units}.values()
+    mazes = {u.maze: u for u in units}
     figure, axes = plt.subplots(1, len(mazes), figsize=(4.5 * len(mazes), 3), squeeze=False)
-    for ax, u in zip(axes[0], mazes):
-        draw_maze(ax, u, u.maze)
-        ax.add_patch(plt.Circle(u.goal, 1.0, color=RED, zorder=4))
-        ax.annotate("start", u.start, (5, -12), textcoords="offset points")
+    for ax, (maze, u) in zip(axes[0], mazes.items()):
+        draw_maze(ax, u, maze)
     common.save_figure(figure, OUT, "fig06_mazes")
 
 
 def draw_fig07(rows, units, examples):
     """Fig 7: mean final distance against N, its 95 % interval over policies and trials; thin: each policy."""
-    rng, curves = np.random.default_rng(0), dict.fromkeys((u.method, u.mode) for u in units)
-    mazes, kinds = {u.maze: u for u in units}.values(), dict.fromkeys(row["reward"] for row in rows)
-    figure, axes = plt.subplots(len(mazes), len(kinds), squeeze=False, sharex=True, sharey=True,
-                                figsize=(4.3 * len(kinds), 0.8 + 2.7 * len(mazes)))
-    for ax, (u, kind) in zip(axes.flat, product(mazes, kinds)):
+    panels, rng = dict.fromkeys((row["maze"], row["reward"]) for row in rows), np.random.default_rng(0)
+    curves = dict.fromkeys((u.method, u.mode) for u in units)
+    colours = [BLUE, RED, "#009E73", "#E69F00", "#CC79A7", "#56B4E9"]  # Okabe-Ito
+    figure, axes = plt.subplots(1, len(panels), figsize=(3.6 * len(panels), 4), sharey=True, squeeze=False)
+    for ax, (maze, kind) in zip(axes[0], panels):
         for n, (method, mode) in enumerate(curves):
-            where = dict(maze=u.maze, reward=kind, method=method, mode=mode)
-            sizes = np.array(sorted({int(row["samples"]) for row in rows if row["method"] == method}))
+            where = dict(maze=maze, reward=kind, method=method, mode=mode)
+            sizes = sorted({int(row["samples"]) for row in rows if row["method"] == method})
             values = [values_of(rows, "final_distance", samples=size, **where) for size in sizes]
             low, high = np.quantile([resampled_means(v, rng) for v in values], [0.025, 0.975], axis=1)
-            mean, closed = np.array([v.mean() for v in values]), mode == "closed"
-            label = NAMES.get(method, method) + ", closed loop" * closed
-            ax.plot(sizes, [v.mean(1) for v in values], color=COLOURS[n], lw=0.5, alpha=0.6)
-            ax.errorbar(sizes * 1.04 ** n, mean, [mean - low, high - mean], color=COLOURS[n], label=label,
-                        ms=4, lw=1.4, capsize=2, marker="osD^vP"[n % 6], ls=["-", "--"][closed])
-        ax.axhline(math.dist(u.start, u.goal), color=GREY, ls=":")
-        ax.set(xscale="log", xlabel="N, samples per plan", title=f"{u.maze}, {kind} reward")
-        ax.set_ylim(0)
-    figure.supylabel("mean final distance (m); dotted: at the start", fontsize=9)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+            ax.plot(sizes, [v.mean(1) for v in values], color=colours[n % 6], lw=0.5, alpha=0.6)
+            ax.fill_between(sizes, low, high, color=colours[n % 6], alpha=0.15)
+            ax.plot(sizes, [v.mean() for v in values], color=colours[n % 6], marker="osD^vP"[n % 6],
+                    label=f"{method}, {mode}")
+        ax.set(xscale="log", xlabel="N, samples per plan", title=f"{maze}, {kind} reward")
+    axes[0, 0].set(ylim=(0, None), ylabel="final distance (m)")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     common.save_figure(figure, OUT, "fig07_planning")
 
 
 def draw_examples(name, kind, rows, units, examples):
-    """Fig 8, 17, 18: trials 0 to 2 of each maze and mode. Blue: planned at each decision, red: executed,
-    dashed grey: the error between the ends of the two, cross: the goal."""
-    shown = {}
-    for example in examples:
-        if example.reward == kind:
-            shown.setdefault((example.u.maze, example.u.mode, example.trial), example)
+    """Fig 8, 17, 18: planned and executed paths of the first policy, a row per maze and mode."""
+    seed = units[0].policy_seed
+    shown = [example for example in examples if (example.reward, example.u.policy_seed) == (kind, seed)]
     if not shown:
         return
-    wide = 1 + max(example.trial for example in shown.values())
+    wide = min(3, shown[0].u.trials)
     high = len(shown) // wide
     figure, axes = plt.subplots(high, wide, figsize=(3.6 * wide, 2.4 * high), squeeze=False)
-    for ax, example in zip(axes.flat, shown.values()):
+    for ax, example in zip(axes.flat, shown):
         u, poses = example.u, example.poses
-        draw_maze(ax, u, f"{u.maze}, {MODE_WORDS[u.mode]}, trial {example.trial}")
+        draw_maze(ax, u, u.title)
         for first, path in example.plans:
-            path, end = path[:u.length + 1], poses[first + u.hold * u.length, :2]
-            ax.plot(*path.T, ".-", color=BLUE, ms=4, label="predicted")
-            ax.plot(*np.stack([path[-1], end]).T, "--", color=GREY, lw=1.2, label="error of the end")
-        ax.plot(*poses[:, :2].T, color=RED, lw=1.2, label="executed")
-    unique = dict(zip(*axes[0, 0].get_legend_handles_labels()[::-1]))
-    figure.legend(unique.values(), unique, loc="outside lower center", ncols=4)
+            ends = np.stack([path[u.length], poses[first + u.hold * u.length, :2]])
+            ax.plot(*ends.T, "--", color=GREY, lw=1.2)
+            ax.plot(*path[:u.length + 1].T, ".-", color=BLUE, ms=4)
+        ax.plot(*poses[:, :2].T, color=RED, lw=1.2)
+    figure.supxlabel("blue: predicted, orange: executed, dashed: error of the end", fontsize=9)
     common.save_figure(figure, OUT, name)
 
 
 def draw_gif(rows, units, examples):
-    """A GIF per maze of trial 0 in the last mode, by MuJoCo's renderer: left the maze, right the Ant."""
-    runs = [example for example in examples if example.trial == 0 and example.u.mode == units[-1].mode]
-    for maze, example in {example.u.maze: example for example in reversed(runs)}.items():
-        model, frames = maze_spec(example.u).compile(), []
+    """A GIF per maze: trial 0 of its first reward in the last mode. Dots: where the Ant goes."""
+    firsts = [example for example in examples if (example.trial, example.reward) == (0, example.u.rewards[0])]
+    for maze, example in {example.u.maze: example for example in firsts}.items():
+        frames, spec = [], maze_spec(example.u)
+        for x, y in example.poses[::10, :2]:
+            spec.worldbody.add_site(pos=[x, y, 0], size=[0.15, 0.15, 0.15], rgba=[0, 0.45, 0.7, 1])
+        model = spec.compile()
         try:
-            renderer = mujoco.Renderer(model, 240, 360)
+            renderer = mujoco.Renderer(model, 320, 480)
         except Exception:  # no GL library, no display, no device: the kinds differ by platform
             return print(f"no {maze}.gif: MuJoCo's renderer finds no GL library (install EGL or OSMesa)")
-        data, far, near = mujoco.MjData(model), mujoco.MjvCamera(), mujoco.MjvCamera()
-        walls = np.reshape(example.u.walls, (-1, 4))
-        places = np.concatenate([example.poses[:, :2], walls[:, ::2], walls[:, 1::2]])
-        low, high = places.min(0), places.max(0)
-        far.lookat, far.distance = [*(low + high) / 2, 0], 0.9 * max((high - low) * (1, 1.5))
-        far.azimuth, far.elevation, near.azimuth, near.elevation, near.distance = 90, -70, 90, -35, 5
-        for i in range(0, len(example.poses), 8):
-            data.qpos[:] = example.poses[i]
+        model.vis.global_.azimuth, model.vis.global_.elevation = 90, -65
+        model.stat.extent *= 0.37  # the camera stands near enough for the walls to fill the picture
+        data = mujoco.MjData(model)
+        for pose in example.poses[::8]:
+            data.qpos[:] = pose
             mujoco.mj_forward(model, data)
-            near.lookat = data.qpos[:3]
-            views = []
-            for camera in (far, near):
-                renderer.update_scene(data, camera)
-                for x, y in example.poses[:i + 1:10, :2]:  # the path so far
-                    dot = renderer.scene.geoms[renderer.scene.ngeom]
-                    mujoco.mjv_initGeom(dot, mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.2),
-                                        np.array([x, y, 0]), np.eye(3).ravel(), np.float32([0.8, 0.4, 0, 1]))
-                    renderer.scene.ngeom += 1
-                views.append(renderer.render().copy())
-            image = Image.fromarray(np.concatenate(views, 1))
-            frames.append(image.quantize(48, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE))
+            renderer.update_scene(data)
+            frames.append(Image.fromarray(renderer.render()).quantize(48, Image.Quantize.MAXCOVERAGE))
         renderer.close()
         buffer = io.BytesIO()
         frames[0].save(buffer, "GIF", save_all=True, append_images=frames[1:], duration=80, loop=0)
