@@ -306,7 +306,7 @@ class Run:
         row |= self.losses
         self.curve.append(row)
         left = self.seconds / 60 * (UPDATES / self.sac.updates - 1)
-        text = [f"{name} {value:.5g}" for name, value in row.items()]
+        text = [f"{name} {round(value, 3)}" for name, value in row.items()]
         speed = self.sac.updates / self.seconds
         print(*text, f"{speed:.0f} updates/s", f"{left:.1f} min left", sep="  ", flush=True)
 
@@ -419,8 +419,8 @@ def check_constants(decoder, names):
              "choose another --decoder or --robot")
     if BASE_FRAME and ROBOT != "ant":
         stop("only a robot in the plane has a base frame: --base_frame false")
-    for name in ("UPDATES ROBOTS EPISODE SKILL_STEPS WARM_UP REPLAY BATCH UPDATES_PER_STEP HIDDEN ACTOR_EVERY "
-                 "THREADS REPORTS Z_DIM RECENT MODEL_BATCH PRIOR_SAMPLES DIRECTIONS TRAVERSAL NOISY STARTS "
+    for name in ("UPDATES ROBOTS EPISODE SKILL_STEPS WARM_UP REPLAY BATCH UPDATES_PER_STEP HIDDEN "
+                 "ACTOR_EVERY THREADS REPORTS Z_DIM RECENT MODEL_BATCH PRIOR_SAMPLES DIRECTIONS TRAVERSAL NOISY STARTS "
                  "SINGLE_RUN MULTI_RUN").split():
         if any(value < 1 or value % 1 for value in np.atleast_1d(globals()[name])):
             stop(f"--{name.lower()} must be whole and above 0")
@@ -693,7 +693,8 @@ def measure(policy, ranges):
             row |= {f"purity_{name}{end}": purity(C, i, i) for i, name in enumerate(policy.names)}
     else:
         row["metric"] = policy.curve[-1]["metric"]
-    print(*(f"{name:24} {value}" for name, value in row.items()), sep="\n")
+    for name, value in row.items():
+        print(f"{name:24} {value if isinstance(value, str) else round(value, 3)}")
     update_csv(Path(OUT) / "results" / "policies.csv", [row], ("experiment", "seed"))
 
 

@@ -203,7 +203,7 @@ def main():
         print(f"{time.time() - start:4.0f} s  {u.title}", flush=True)
     present = {u.settings for u in units}
     rows = [row for row in common.read_csv(path) if row.get("settings") in present]
-    print(f"wrote {path}; mean distance to the goal at the end, and share of trials that end nearer than epsilon:")
+    print(f"wrote {path}; distance to the goal at the end, mean, and share of trials nearer than EPSILON:")
     print_table(rows)
     for name in DRAW.split():
         DRAWINGS[name](rows, units, examples)

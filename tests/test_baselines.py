@@ -5,7 +5,6 @@ import math
 from types import SimpleNamespace
 
 import common
-import numpy as np
 import pytest
 import torch
 from torch import distributions as D
