@@ -1,8 +1,16 @@
-"""Timings in one run on one machine, by hand, 2 minutes on an idle one: `pip install stable-baselines3 && python tests/bench.py`.
+"""Speed against what a user would take instead, by hand on an idle machine: `pip install stable-baselines3` first.
 
-Critic updates/s at two layers of 256 and batches of 256 against Stable-Baselines3's gradient steps (ours: actor and value
-network in each second one); environment steps/s against Gymnasium's vector Ant-v5 and against bare mj_step. One thread, or as it
-says; each figure is the median of five rounds, in turns, so that a busy moment hits all. Writes results/bench.csv."""
+python tests/bench.py            3 minutes. Critic updates/s at two layers of 256 and batches of 256 against Stable-Baselines3's
+                                 gradient steps (ours: actor and value network in each second one); environment steps/s against
+                                 Gymnasium's vector Ant-v5 and bare mj_step; updates/s of the whole loop on one core and on two.
+                                 One thread, or as it says; the median of five rounds in turns, a busy moment hits all.
+python tests/bench.py tracking   as many minutes as the shipped ant_semi policies took: Stable-Baselines3's SAC with its defaults on
+                                 the same task (robot, base frame, commands, reward), then its tracking error beside ours.
+Writes results/bench.csv."""
+import contextlib
+import io
+import sys
+import tempfile
 import time
 import warnings
 
@@ -34,7 +42,7 @@ def rate(work, count):
 def our_updates():
     sac = s3.Sac(S + 1, C, A)
     x, a, x2, r = torch.randn(BATCH, S + C), torch.rand(BATCH, A), torch.randn(BATCH, S + C), torch.randn(BATCH)
-    return lambda: sac.update(x, a, x2, r, 0.97)
+    return lambda: sac.update(x, a, x2, r)
 
 
 def sb3_updates():
@@ -79,16 +87,109 @@ def gymnasium_vector():
     return lambda: envs.step(action)
 
 
-if __name__ == "__main__":
+def whole_loop(threads):
+    """Updates/s of 03 from its own printed line, 4000 updates."""
+    with tempfile.TemporaryDirectory() as out, contextlib.redirect_stdout(io.StringIO()) as text:
+        stage, sys.argv = script("03_train_policy"), ["03", "--updates", "4000", "--reports", "1", "--threads", str(threads),
+                                                      "--out", out]
+        stage.measure = stage.draw_skills = stage.draw_robots = lambda *_: None
+        stage.main()
+    return float(text.getvalue().split(" updates/s")[0].split()[-1])
+
+
+# ---------------------------------------------------------------- the same task for Stable-Baselines3
+
+class Follow(gymnasium.Env):
+    """One Ant that is to follow commands, as in 03: what it sees is Actor.inputs without the normalisation, a new skill every
+    SKILL_STEPS, the reward of Eq. 6 with the deviation that 03 ends with, an episode of EPISODE steps that is no terminal one."""
+
+    def __init__(self, decoder, seed):
+        self.decoder, self.rng, self.robots = decoder, np.random.default_rng(seed), common.Robots(common.robot_spec("ant"), 1, 1)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (28,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1, 1, (8,), np.float32)
+
+    def see(self):
+        return torch.cat(common.to_base_frame(self.robots.observe(), self.command), 1)[0].numpy()
+
+    def skill(self):
+        z = torch.from_numpy(self.rng.normal(size=(1, 2))).float()
+        self.command, self.log_var = (v.detach() for v in common.first_step(self.decoder, z))
+
+    def reset(self, seed=None, options=None):
+        self.robots.reset(np.array([0]), self.rng)
+        self.age = 0
+        self.skill()
+        return self.see(), {}
+
+    def step(self, action):
+        displacement, unstable = self.robots.step(action[None])
+        r = 0.0 if unstable[0] else s3.reward(self.command, self.log_var, displacement, s3.FLOOR_END).item() / s3.REWARD_SCALE
+        self.age += 1
+        if self.age % s3.SKILL_STEPS == 0:
+            self.skill()
+        return self.see(), r, False, bool(self.age >= s3.EPISODE or unstable[0]), {}
+
+
+class Theirs:
+    """Stable-Baselines3's policy as an actor of ours."""
+
+    def __init__(self, model):
+        self.model = model
+
+    def act(self, s, c, deterministic):
+        return torch.from_numpy(self.model.predict(torch.cat(common.to_base_frame(s, c), 1).numpy(), deterministic=deterministic)[0])
+
+
+def tracking_after(minutes):
+    """Tracking error, open and closed loop, of Stable-Baselines3's SAC after so many minutes on two threads."""
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    class Clock(BaseCallback):
+        start = time.time()
+
+        def _on_step(self):
+            if self.n_calls % 2000 == 0:
+                print(f"{self.num_timesteps} steps, {(time.time() - self.start) / 60:.1f} min", flush=True)
+            return time.time() - self.start < 60 * minutes
+
+    torch.set_num_threads(2)
+    decoder = common.unpack(common.load("pretrained", "wetvae", "main", 0)["decoder"])
+    envs = DummyVecEnv([lambda seed=seed: Follow(decoder, seed) for seed in range(4)])
+    model = SAC("MlpPolicy", envs, gradient_steps=-1, device="cpu", seed=0)  # an update for each environment step, its default
+    model.learn(10 ** 9, callback=Clock())
+    policy = s3.as_policy(Theirs(model), decoder, ["speed", "direction", "curvature"], {})
+    return s3.tracking(policy, False), s3.tracking(policy, True)
+
+
+def compare_tracking():
+    ours = [row for row in common.read_csv(ROOT / "results/policies.csv") if row["experiment"] == "ant_semi"]
+    minutes, *errors = (float(np.mean([float(row[name]) for row in ours]))
+                        for name in ("train_minutes", "tracking_error", "tracking_error_closed"))
+    return [(f"tracking error after {minutes:.0f} minutes, {loop}", error, peer, "Stable-Baselines3 SAC, seed 0",
+             f"mean of {len(ours)} of ours; lower is better")
+            for loop, error, peer in zip(("open loop", "closed loop"), errors, tracking_after(minutes))]
+
+
+def speeds():
     measures = dict(ours=rate(our_updates(), 1), sb3=rate(sb3_updates(), 4), robots=rate(our_robots(1), 64),
                     robots2=rate(our_robots(2), 64), mj_step=rate(bare_mj_step(), 1), vector=rate(gymnasium_vector(), 8))
     rounds = [{name: measure() for name, measure in measures.items()} for _ in range(ROUNDS)]
     v = {name: float(np.median([one[name] for one in rounds])) for name in measures}
-    rows = [("SAC updates", v["ours"], v["sb3"], "Stable-Baselines3 SAC", "updates/s, one thread"),
+    return [("SAC updates", v["ours"], v["sb3"], "Stable-Baselines3 SAC", "updates/s, one thread"),
             ("Ant steps", v["robots"], v["vector"], "Gymnasium SyncVectorEnv of 8 Ant-v5", "environment steps/s, one thread"),
             ("Ant steps", v["robots"], v["mj_step"], "bare mj_step of the same Ant", "environment steps/s, one thread"),
-            ("Ant steps, two threads", v["robots2"], v["robots"], "ours on one thread", "environment steps/s")]
+            ("Ant steps, two threads", v["robots2"], v["robots"], "ours on one thread", "environment steps/s"),
+            ("whole training loop", whole_loop(2), whole_loop(1), "ours on one core", "updates/s on two cores")]
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1 and sys.argv[1:] != ["tracking"]:
+        sys.exit("usage: python tests/bench.py [tracking]")
+    rows = compare_tracking() if sys.argv[1:] else speeds()
     for what, ours, peer, name, unit in rows:
-        print(f"{what:24s} {ours:8.1f}   {name:36s} {peer:8.1f}   ratio {ours / peer:5.2f}   {unit}")
+        print(f"{what:24s} {ours:8.3f}   {name:36s} {peer:8.3f}   ratio {ours / peer:5.2f}   {unit}")
     common.update_csv(ROOT / "results/bench.csv", [dict(what=what, ours=ours, peer=peer, peer_name=name, ratio=ours / peer,
-                                                        unit=unit) for what, ours, peer, name, unit in rows], ())
+                                                        unit=unit) for what, ours, peer, name, unit in rows], ("what", "peer_name"))
+    (ROOT / "results/bench.csv.lock").unlink(missing_ok=True)
