@@ -36,7 +36,7 @@ DECODER = "main"         # experiment of 02 whose decoder is the reward
 DECODER_SEED = 0         # and its seed
 ROBOT = "ant"            # ant or half_cheetah
 STEP_SCALE = 0.1         # metres per trajectory unit, App. A.1.3: 1/10, Half-Cheetah 1/5
-VARIANCE_SCALE = 0.003   # decoder variance -> square metres (A.1.3: 1/20, which hardly minds a slow fast skill)
+VARIANCE_SCALE = 0.003   # decoder variance -> square metres (A.1.3: 1/20, which leaves fast skills too slow)
 BASE_FRAME = True        # networks read state and command in the base frame (the paper: in the world's)
 
 UPDATES = 100_000        # updates of the critics (the paper: 1.92 million)
@@ -420,8 +420,8 @@ def check_constants(decoder, names):
     if BASE_FRAME and ROBOT != "ant":
         stop("only a robot in the plane has a base frame: --base_frame false")
     for name in ("UPDATES ROBOTS EPISODE SKILL_STEPS WARM_UP REPLAY BATCH UPDATES_PER_STEP HIDDEN "
-                 "ACTOR_EVERY THREADS REPORTS Z_DIM RECENT MODEL_BATCH PRIOR_SAMPLES DIRECTIONS TRAVERSAL NOISY STARTS "
-                 "SINGLE_RUN MULTI_RUN").split():
+                 "ACTOR_EVERY THREADS REPORTS Z_DIM RECENT MODEL_BATCH PRIOR_SAMPLES DIRECTIONS TRAVERSAL NOISY "
+                 "STARTS SINGLE_RUN MULTI_RUN").split():
         if any(value < 1 or value % 1 for value in np.atleast_1d(globals()[name])):
             stop(f"--{name.lower()} must be whole and above 0")
     for name in "STEP_SCALE VARIANCE_SCALE LEARNING_RATE FLOOR_START FLOOR_END Z_RANGE".split():
