@@ -420,8 +420,8 @@ def check_constants(decoder, names):
     if BASE_FRAME and ROBOT != "ant":
         stop("only a robot in the plane has a base frame: --base_frame false")
     for name in ("UPDATES ROBOTS EPISODE SKILL_STEPS WARM_UP REPLAY BATCH UPDATES_PER_STEP HIDDEN "
-                 "ACTOR_EVERY THREADS REPORTS Z_DIM RECENT MODEL_BATCH PRIOR_SAMPLES DIRECTIONS TRAVERSAL NOISY "
-                 "STARTS SINGLE_RUN MULTI_RUN").split():
+                 "ACTOR_EVERY THREADS REPORTS Z_DIM RECENT MODEL_BATCH PRIOR_SAMPLES DIRECTIONS TRAVERSAL "
+                 "NOISY STARTS SINGLE_RUN MULTI_RUN").split():
         if any(value < 1 or value % 1 for value in np.atleast_1d(globals()[name])):
             stop(f"--{name.lower()} must be whole and above 0")
     for name in "STEP_SCALE VARIANCE_SCALE LEARNING_RATE FLOOR_START FLOOR_END Z_RANGE".split():
