@@ -93,7 +93,8 @@ def test_killed_three_times_it_ends_with_the_same_bits(fork, out):
     ("--experiment ant_sectar --z_dim 2", "--z_dim is at least 3"),
     ("--experiment ant_dads --robot half_cheetah", "--robot ant"), ("--experiment ant_dads --z_dim 3", "--z_dim 2"),
     ("--decoder nope", "python 02_train_wetvae.py --experiment nope --seed 0"),
-    ("--decoder_seed 7", "python 02_train_wetvae.py --experiment main --seed 7"),
+    ("--experiment ant_full --decoder_seed 7", "python 02_train_wetvae.py --experiment full --seed 7"),
+    ("--robots 2.5", "a whole number"), ("--decoder_seed 7", "python 02_train_wetvae.py --experiment main --seed 7"),
     ("--method ppo", "--method is wedis, dads or sectar"), ("--robot dog", "--robot is ant or half_cheetah"),
     ("--train false --seed 98", "python 03_train_policy.py --experiment ant_semi --seed 98"),
     ("--discount 1", "below 1"), ("--relabelled 2", "at most 1"),
@@ -118,7 +119,7 @@ def test_a_loss_that_is_not_finite_overwrites_nothing(experiment, s3, inside, ou
 
 STAGES = {name: script(name) for name in (S1, S2, S3, S4)}
 SMALL = {S1: dict(TRAJECTORIES=300), S2: dict(EPOCHS=1, BATCH=100, HIDDEN=8, THREADS=1, RESUME=False),
-         S3: {key.upper(): common.convert(str(value), getattr(STAGES[S3], key.upper()), True, key)
+         S3: {key.upper(): common.convert(str(value), getattr(STAGES[S3], key.upper()), key)
               for key, value in TINY.items()},
          S4: dict(TRIALS=1, SAMPLES="4", HOLD=2, EPISODE=20, POOL=64, DRAW="", MAZES="maze1", THREADS=1)}
 BASELINES = dict.fromkeys("Z_DIM RECENT EXPLORE KL_WEIGHT".split(), "ant_sectar") | dict.fromkeys(
