@@ -155,7 +155,7 @@ def load(out, kind, experiment, seed):
     """Read an artifact from <out>/, else pretrained/, and say which. Returns its content and "sha256" (hex
     digits). Exits with 2 and one line if it is missing, damaged, foreign or not finite."""
     name = artifact_name(kind, experiment, seed)
-    row = experiment.removesuffix("_none").removesuffix("_circle")  # 02 makes these beside the row's own model
+    row = experiment.removesuffix("_none").removesuffix("_circle")  # 02 makes these in one row
     make = f"make it with: python {SCRIPT[kind.partition('-')[0]]} --experiment {row} --seed {seed}"
     paths = [path for path in (Path(out) / name, HERE / "pretrained" / name) if path.exists()]
     if not paths:

@@ -127,7 +127,7 @@ def test_log_probability_is_that_of_a_transformed_distribution():
 def test_reward_is_equation_6_up_to_its_maximum(s3):
     torch.manual_seed(0)
     mean, log_var, displacement = torch.randn(40, 2), torch.randn(40, 2), 0.1 * torch.randn(40, 2)
-    # without a floor: App. A.1.3; then a floor above all deviations
+    s3.VARIANCE_SCALE = 1 / 20  # App. A.1.3; without a floor, then with one above all deviations
     for floor, std in ((0.0, (log_var.exp() / 20).sqrt()), (10.0, torch.full((40, 2), 10.0))):
         p = D.Independent(D.Normal(mean / 10, std), 1)
         expected = s3.REWARD_SCALE * (p.log_prob(displacement) - p.log_prob(mean / 10))
