@@ -100,8 +100,9 @@ def parse_flags(stage, argv=None):
             stop(f"{where} is no constant of this file")
         stage[name] = convert(value, stage[name], where) if name in names else value
     stage.update(given)
+    signed = [name for row in rows.values() for name, v in row.items() if type(v) in (int, float) and v < 0]
     for name in names:
-        if isinstance(stage[name], (int, float)) and stage[name] < 0:
+        if name not in signed and isinstance(stage[name], (int, float)) and stage[name] < 0:
             stop(f"--{name.lower()} must be 0 or more")
     write_whole(Path(stage["OUT"]) / f".can_write_{os.getpid()}", b"").unlink()  # before any work is lost
     return {name: stage[name] for name in names}, given
