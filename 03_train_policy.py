@@ -683,7 +683,7 @@ def executed_cross_talk(policy, ranges, closed):
 def measure(policy, ranges):
     """Print and write one row of results/policies.csv. _open: open loop, as in the paper."""
     row = dict(experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy.updates,
-               env_steps=policy.env_steps, train_minutes=policy.seconds / 60,
+               env_steps=policy.env_steps, train_minutes=policy.seconds / 60, threads=policy.config["THREADS"],
                tracking_error=tracking(policy, False))
     if METHOD == "wedis":
         row["tracking_error_closed"] = tracking(policy, True)

@@ -28,6 +28,7 @@ KEYS = {  # of each results file: the columns that name a row, or a group of row
     "bench": ("what", "peer_name"),
 } | dict.fromkeys(("mazes", "figure7", "fig18", "matched"), ("maze", "method", "mode", "seed", "policy_seed"))
 DECODERS = ("main", "main_none", "full_circle", "speed_acc")  # that policies and Fig 4 need
+CORES = {"1": "one core, another training beside it", "2": "two cores"}
 LARGEST = 2_000_000  # bytes of a shipped file
 NOT_YET = "not measured yet with this edition"
 PANELS = [(maze, kind) for maze in ("maze1", "maze2") for kind in ("dense", "sparse")]
@@ -209,7 +210,7 @@ def scripts():
     expect, minutes = NOT_YET, NOT_YET
     if policy:
         error, closed = (number(policy[0][key]) for key in ("tracking_error", "tracking_error_closed"))
-        minutes = number(policy[0]["train_minutes"], ".0f")
+        minutes = f"{number(policy[0]['train_minutes'], '.0f')} ({CORES[policy[0]['threads']]})"
         expect = f"tracking error {error} open loop, {closed} closed loop"
     rows.append(["`python 03_train_policy.py`", minutes, "skill policy of the Ant, Fig 5, 14", expect])
     rows.append(["`python 04_mpc_maze.py`", minutes_of_04(), "mazes, Fig 3, 6, 8, 17, GIFs", "the table above"])
@@ -242,13 +243,13 @@ def absent(names):
 def fig5():
     rows = []
     for row in policy_rows(POLICIES[:4]):
-        rows.append([f"`{row['experiment']}`", row["seed"], number(row["train_minutes"], ".0f"),
+        rows.append([f"`{row['experiment']}`", row["seed"], number(row["train_minutes"], ".0f"), row["threads"],
                      number(row["tracking_error"]), number(row["tracking_error_closed"]),
                      number(row["follow_median_m"]) + " m", number(row["follow_p90_m"]) + " m",
                      number(row["fall_rate"], ".1f", 100) + " %"])
     if not rows:
         return missing("Policies are", "python 03_train_policy.py")
-    return markdown(["policy", "seed", "minutes", "tracking error, open", "closed", "following error, median", "90 %",
+    return markdown(["policy", "seed", "minutes", "threads", "tracking error, open", "closed", "following error, median", "90 %",
                      "falls"], rows) + absent(POLICIES[:4]) + ["", *picture("fig05_skills_wedis.png", "Fig 5")]
 
 
