@@ -75,7 +75,9 @@ def learning_curves():
     common.update_csv(ROOT / "results" / "learning_curves.csv", rows, ())
     (ROOT / "results" / "learning_curves.csv.lock").unlink(missing_ok=True)
     names = [name for name in POLICIES if select(rows, experiment=name)]
-    figure, axes = common.plt.subplots(2, 4, figsize=(11, 4.6), sharey=True)
+    wide = min(4, len(names))
+    high = -(-len(names) // wide)
+    figure, axes = common.plt.subplots(high, wide, figsize=(3 * wide, 2.4 * high), sharey=True, squeeze=False)
     for ax, name in zip(axes.flat, names):
         for seed in dict.fromkeys(row["seed"] for row in select(rows, experiment=name)):
             own = select(rows, experiment=name, seed=seed)
@@ -87,7 +89,7 @@ def learning_curves():
     for ax in axes.flat[len(names):]:
         ax.axis("off")
     found = dict(zip(*axes[0, 0].get_legend_handles_labels()[::-1]))
-    figure.legend(found.values(), found, loc="outside lower right")
+    figure.legend(found.values(), found, loc="outside lower center", ncols=2)
     common.save_figure(figure, ROOT, "learning_curves")
 
 
