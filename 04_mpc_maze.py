@@ -1,7 +1,7 @@
 """Stage 4: decoder + policy -> mazes solved without training in them (Sec. 5, Algorithm 2, Sec. 6.2).
 
 In: policy_<POLICY>_seed<n>.pt of stage 3. Out: <OUT>/results/<EXPERIMENT>.csv, a row per trial, and figures.
-  python 04_mpc_maze.py                          Fig 3, 6, 8, 17 and GIFs, 100 s on two cores
+  python 04_mpc_maze.py                          Fig 3, 6, 8, 17 and GIFs, 56 s on two cores
   python 04_mpc_maze.py --experiment figure7     or another row of EXPERIMENTS below
 Expect, mean of 3 policies and 50 trials each, final distances of 3.6 and 1.9 m (mazes 1 and 2, dense), 4.7
 and 4.4 m (sparse) as printed; 1.1, 0.8, 3.6, 3.5 m in closed loop. The start is 26.8 m from the goal.
