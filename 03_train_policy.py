@@ -229,7 +229,7 @@ class Run:
         block = ROBOTS * SKILL_STEPS
         self.replay = torch.zeros(REPLAY // block * block, sum(self.widths))
         self.z = torch.zeros(ROBOTS, z_dim)
-        self.age = self.rng.integers(0, EPISODE, ROBOTS)  # robots start, and change skills, at other times
+        self.age = self.rng.integers(0, EPISODE, ROBOTS)  # each robot changes skills at its own time
         if METHOD == "sectar":
             self.age -= self.age % SKILL_STEPS  # together: trajectories are rows of the replay buffer
         self.steps, self.unstable, self.seconds = 0, 0, 0.0
