@@ -460,8 +460,11 @@ def draw_fig07(rows, units, examples):
     for ax, (maze, kind) in zip(axes[0], panels):
         for n, (method, mode) in enumerate(curves):
             where = dict(maze=maze, reward=kind, method=method, mode=mode)
-            sizes = sorted({int(row["samples"]) for row in rows if row["method"] == method})
-            values = [values_of(rows, "final_distance", samples=size, **where) for size in sizes]
+            own = [row for row in rows if all(row[name] == value for name, value in where.items())]
+            sizes = sorted({int(row["samples"]) for row in own})
+            if not sizes:
+                continue  # a row of METHODS may plan for one reward only
+            values = [values_of(own, "final_distance", samples=size) for size in sizes]
             low, high = np.quantile([resampled_means(v, rng) for v in values], [0.025, 0.975], axis=1)
             ax.plot(sizes, [v.mean(1) for v in values], color=colours[n % 6], lw=0.5, alpha=0.6)
             ax.fill_between(sizes, low, high, color=colours[n % 6], alpha=0.15)
@@ -469,7 +472,8 @@ def draw_fig07(rows, units, examples):
                     label=f"{method}, {mode}")
         ax.set(xscale="log", xlabel="N, samples per plan", title=f"{maze}, {kind} reward")
     axes[0, 0].set(ylim=(0, None), ylabel="final distance (m)")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
+    labels = {label: line for ax in axes[0] for line, label in zip(*ax.get_legend_handles_labels())}
+    figure.legend(labels.values(), labels, loc="outside lower center", ncols=6)
     common.save_figure(figure, OUT, "fig07_planning")
 
 

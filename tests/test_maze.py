@@ -378,6 +378,13 @@ def test_a_deleted_maze_and_two_methods_draw_what_is_left(s4, stage):
     assert done.code == 0 and "maze2      dense   wedis" in done.out, done.err
 
 
+def test_fig_7_copes_with_a_method_for_one_reward(s4, stage, out):
+    s4.METHODS["mine"] = dict(REWARDS="dense", MODES="printed", SAMPLES="3 7")
+    done = stage(mazes="maze1", method="mine wedis", draw="fig07")
+    assert done.code == 0, done.err
+    assert (out / "figures" / "fig07_planning.png").stat().st_size > 10_000
+
+
 def test_goal_and_epsilon_are_flags(stage):
     done = stage(mazes="maze1", goal="3 0.5", epsilon=2)
     assert done.code == 0, done.err
