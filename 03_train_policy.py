@@ -3,7 +3,7 @@
 Reads runs/wetvae_*.pt of stage 2. A skill z_single asks for a step: the decoder's first displacement, here
 called the command c. The reward is the decoder's log-likelihood of the step that the robot makes (Eq. 6).
 Writes runs/policy_<experiment>_seed<seed>.pt, Fig 5, 14 (15, 16) and a row of runs/results/policies.csv.
-Takes 15 minutes on two cores at 112 updates a second. Expect, mean of 3 seeds: tracking error 0.14 in open
+Takes 16 minutes on two cores (timed once, ant_full). Expect, mean of 3 seeds: tracking error 0.14 in open
 loop, 0.11 in closed loop; there 0.09 m off after a skill of 200 steps (median), and 1.5 % turn over in three.
 """
 import copy
@@ -734,10 +734,11 @@ def draw_skills(policy):
             for line, dots, value, colour in zip(path, marks, values, colours):
                 ax.plot(*line.T, color=colour, lw=1.3, label=f"{value:g}")
                 ax.plot(*dots.T, "o", ms=3 if len(dots) < 10 else 0, color=colour)
-        axes[0, i].set_title(f"$z_{{{name}}}$, $T$ = {int(run[0])}, $H_z$ = {int(run[1])}")
-        axes[-1, i].set_xlabel("x (m)")
+        title = f"$z_{{{name}}}$, $T$ = {int(run[0])}, $H_z$ = {int(run[1])}"
         if len(values) > 9:
-            axes[0, i].legend(fontsize=5, ncols=2, handlelength=1)
+            title += f"\n{len(values)} latents from {values[0]:g} (pale blue) to {values[-1]:g}"
+        axes[0, i].set_title(title)
+        axes[-1, i].set_xlabel("x (m)")
     for ax, text in zip(axes[:, 0], rows):
         ax.set_ylabel(f"{text}\n{'latent' if rail else 'y (m)'}")
     handles = axes[0, 0].get_legend_handles_labels()
