@@ -14,9 +14,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import common  # before mujoco: it chooses how mujoco renders
-from common import (MULTI, SINGLE, Actor, Decoder, Robots, SkillDynamics, artifact_name, check_same,
-                    commands_of, cross_talk, execute, factors_of, first_step, layers, load, load_policy, pack,
-                    parse_flags, plt, purity, robot_spec, save, save_figure, stop, unpack, update_csv)
+from common import (CORRECTION, MULTI, SINGLE, Actor, Decoder, Robots, SkillDynamics, artifact_name,
+                    check_same, commands_of, cross_talk, execute, factors_of, first_step, layers, load,
+                    load_policy, pack, parse_flags, plt, purity, robot_spec, save, save_figure, stop, unpack,
+                    update_csv)
 import mujoco
 import numpy as np
 import torch
@@ -48,6 +49,7 @@ REPLAY = 1_000_000       # size of the replay buffer R, steps
 UPDATES_PER_STEP = 8     # updates in each step of all robots
 BATCH = 256              # App. A.1.3
 RELABELLED = 0.5         # share of a batch that is given a fresh skill (hindsight relabelling; the paper: 0)
+CORRECTED = 0.5          # share of skills with a random correction, as the closed loop adds it (the paper: 0)
 
 HIDDEN = 256             # width of the two hidden layers (the paper: 512)
 LEARNING_RATE = 1e-3     # Adam (the paper: 3e-4, fixed)
@@ -192,10 +194,22 @@ def reward(mean, log_var, displacement, floor):
 
 def train_wedis(run, decoder):
     """Alg. 1, the second loop: train run.sac to follow the decoder's single steps."""
-    m1 = run.z.shape[1]
+    m1 = run.z.shape[1] - decoder.x_dim
+
+    def draw(n):
+        """z_single from the prior and beside it a correction of the command, in a disc or 0: (n, m1 + 2)."""
+        length = CORRECTION * torch.rand(n, 1).sqrt() * (torch.rand(n, 1) < CORRECTED)
+        correction = length * nn.functional.normalize(torch.randn(n, decoder.x_dim))
+        return torch.cat([torch.randn(n, m1), correction], 1)
+
+    def command_of(z):
+        """Mean and log-variance of the step that is asked for, (n, 2) each."""
+        mean, log_var = first_step(decoder, z[:, :m1])  # Alg. 1: z = (z_single, 0)
+        return mean + z[:, m1:], log_var
+
     while run.sac.updates < UPDATES:
-        run.renew(torch.randn(ROBOTS, m1))  # Alg. 1: sample z_single from the prior
-        command, _ = first_step(decoder, run.z)  # Alg. 1: z = (z_single, 0)
+        run.renew(draw(ROBOTS))  # Alg. 1: sample z_single from the prior
+        command, _ = command_of(run.z)
         run.act(command)  # Alg. 1: execute actions; the physics runs on the second core from here on
 
         if run.warm():
@@ -204,8 +218,8 @@ def train_wedis(run, decoder):
             floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** min(1, max(0, (progress - 0.15) / 0.45))
             s, a, s2, displacement, z = run.sample(UPDATES_PER_STEP * BATCH)  # Alg. 1: sample a batch
             fresh = torch.rand(len(z), 1) < RELABELLED
-            z = torch.where(fresh, torch.randn(z.shape), z)  # any stored step can be judged by any skill
-            command, log_var = first_step(decoder, z)
+            z = torch.where(fresh, draw(len(z)), z)  # any stored step can be judged by any skill
+            command, log_var = command_of(z)
             r = reward(command, log_var, displacement, floor)  # Alg. 1: compute the reward, Eq. 6
             x, x2 = run.sac.actor.inputs(s, command), run.sac.actor.inputs(s2, command)
             for batch in zip(*(v.split(BATCH) for v in (x, a, x2, r))):
@@ -381,7 +395,7 @@ def main():
     if TRAIN and METHOD == "wedis":
         relation = calibrate_relation(decoder, names, source["length"])
         z_dim = sum(name in SINGLE for name in names)
-        run = Run(z_dim, decoder.x_dim, decoder, names, config)
+        run = Run(z_dim + decoder.x_dim, decoder.x_dim, decoder, names, config)
         train_wedis(run, decoder)
     elif TRAIN:
         run = make_baseline(config)
@@ -427,7 +441,7 @@ def check_constants(decoder, names):
     for name in "STEP_SCALE VARIANCE_SCALE LEARNING_RATE FLOOR_START FLOOR_END Z_RANGE".split():
         if globals()[name] <= 0:
             stop(f"--{name.lower()} must be above 0")
-    if DISCOUNT >= 1 or max(RELABELLED, EXPLORE, AVERAGED, SMOOTHING, DECAY_FROM) > 1:
+    if DISCOUNT >= 1 or max(RELABELLED, CORRECTED, EXPLORE, AVERAGED, SMOOTHING, DECAY_FROM) > 1:
         stop("--discount is below 1; shares and rates are at most 1")
     block = ROBOTS * SKILL_STEPS
     if EPISODE % SKILL_STEPS or REPLAY < max(WARM_UP, 2 * block) or METHOD == "sectar" and WARM_UP < block:
