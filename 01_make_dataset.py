@@ -21,8 +21,8 @@ FIGURE = ""             # name of the figure, which shows direction and curvatur
 TRAJECTORIES = 100_000  # N, App. A.1.1
 LENGTH = 5              # T, transitions per trajectory
 FACTORS = "speed direction curvature"  # what is drawn; without direction trajectories have one dimension
-SPEED_LOW = 0.0         # speed ~ U(SPEED_LOW, SPEED_HIGH), trajectory units per transition (Table 1, 2D)
-SPEED_HIGH = 1.0        # no transition is longer than 1
+SPEED_LOW = 0.0         # speed ~ U(SPEED_LOW, SPEED_HIGH), trajectory units per transition; in 1D both ways:
+SPEED_HIGH = 1.0        # U(-SPEED_HIGH, SPEED_HIGH) (Table 1); no transition is longer than 1
 DIRECTION = 90.0        # direction ~ U(-DIRECTION, DIRECTION), degrees: the right-sided semicircle
 CURVATURE = 30.0        # curvature ~ U(-CURVATURE, CURVATURE), degrees per transition; + turns left
 ACCELERATION = 0.2      # acceleration ~ U(-ACCELERATION, ACCELERATION) times the speed per transition
@@ -32,7 +32,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
     "main": dict(FIGURE="fig09_dataset"),
     "full": dict(DIRECTION=180.0),                                        # the Ant of Fig 15
     "polar": dict(FACTORS="speed direction", DIRECTION=180.0),            # Fig 11: radius and angle
-    "speed_acc": dict(FACTORS="speed acceleration", SPEED_LOW=-1.0),      # Fig 12 and 16, in one dimension
+    "speed_acc": dict(FACTORS="speed acceleration"),                      # Fig 12 and 16, in one dimension
     "four_factors": dict(FACTORS="speed direction curvature acceleration", DIRECTION=180.0),  # Fig 13
 }
 
@@ -53,13 +53,11 @@ def check(names, limits):
     """End with one line if these constants make no data set from which the factors can be learnt."""
     if "speed" not in names or not set(names) <= set(limits):
         stop(f"--factors {FACTORS!r} must name speed, and besides it only {' '.join(limits)}")
-    if min(TRAJECTORIES, LENGTH) < 1 or max(DIRECTION, CURVATURE) > 180:
-        stop("--trajectories and --length must be at least 1, --direction and --curvature at most 180")
+    if max(DIRECTION, CURVATURE) > 180:
+        stop("--direction and --curvature must be at most 180")
     for name in names:
         if limits[name][0] >= limits[name][1] or (name in common.MULTI and STRAIGHT >= 1):
             stop(f"{name} is the same in all trajectories: widen its range, or leave it out of --factors")
-    if "direction" in names and SPEED_LOW < 0:
-        stop(f"--speed_low {SPEED_LOW:g} must be at least 0: in two dimensions direction gives the way")
     if "curvature" in names and "direction" not in names:
         stop("--factors with curvature needs direction too: one dimension has no turns")
     if "acceleration" in names and ACCELERATION * (LENGTH - 1) >= 1:
@@ -69,7 +67,8 @@ def check(names, limits):
 
 def main():
     config, _ = parse_flags(globals())
-    limits = dict(speed=(SPEED_LOW, SPEED_HIGH), direction=(-DIRECTION, DIRECTION),
+    slowest = SPEED_LOW if "direction" in FACTORS.split() else -SPEED_HIGH
+    limits = dict(speed=(slowest, SPEED_HIGH), direction=(-DIRECTION, DIRECTION),
                   curvature=(-CURVATURE, CURVATURE), acceleration=(-ACCELERATION, ACCELERATION))
     check(FACTORS.split(), limits)
     names = [name for name in limits if name in FACTORS.split()]  # this order is that of z in all stages

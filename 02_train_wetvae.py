@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 import common
 from common import (Decoder, check_same, cross_talk, factors_of, load, on_circle, pack, parse_flags, plt,
-                    purity, read_csv, save, save_figure, spread, stop, unpack, update_csv, weak_labels)
+                    purity, save, save_figure, spread, stop, unpack, update_csv, weak_labels)
 
 EXPERIMENT = "main"    # row of EXPERIMENTS below
 SEED = 0               # random seed
@@ -43,7 +43,6 @@ EPOCHS = 12            # passes over the data (the paper: 300)
 LEARNING_RATE = 2e-3   # of Adam, falls linearly to 0 (the paper: 2e-4, fixed)
 
 FIGURE = ""            # name of the figure of traversals ("": traversals_<experiment>)
-SEEDS_FIGURE = ""      # name of the figure of all seeds in results/wetvae.csv ("": none)
 MODELS = {"": {}}      # models of a row: end of the file's name, and the constants in which it differs
 COLUMNS = []           # columns of its figure: title, model, T ([]: each model, at the T of the data)
 # With the beta of the WET-VAE the latents of the trajectory VAE collapse (KL 0.000): no fair comparison.
@@ -53,8 +52,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
     "main": dict(FIGURE="fig04_latent_traversals", MODELS={"": {}, "none": NONE}, COLUMNS=[
         ("(a) WET-VAE, T = 1", "", 1), ("(b) WET-VAE, T = 5", "", 5), ("(c) WET-VAE, T = 10", "", 10),
         ("(d) trajectory VAE, T = 5", "none", 5)]),
-    "seeds": dict(SEEDS_FIGURE="seeds_wetvae",
-                  MODELS={"": {}, "plain": PRINTED | dict(EPOCHS=24), "none": NONE}),
+    "seeds": dict(MODELS={"": {}, "plain": PRINTED | dict(EPOCHS=24), "none": NONE}),
     "beta_gamma": PRINTED | dict(FIGURE="fig10_beta_gamma", MODELS={
         f"b{b}_g{g}": dict(BETA=b, GAMMA=g) for b, g in ((9, 0), (9, 1), (1, 10), (3, 10), (9, 10))}),
     "polar": dict(DATA="polar", LABELS="speed direction", FIGURE="fig11_polar_cartesian", MODELS={
@@ -63,10 +61,9 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
                       FIGURE="fig12_speed_acceleration", MODELS={"": {}, "none": NONE}),
     "four_factors": dict(DATA="four_factors", LABELS="speed direction curvature acceleration", EPOCHS=60,
                          BETA=4.0, FIGURE="fig13_four_factors", MODELS={"": {}, "circle": dict(CIRCLE=True)}),
-    "full": dict(DATA="full", FIGURE="full_circle_traversals", SEEDS_FIGURE="seeds_full_circle",
-                 MODELS={"": {}, "circle": dict(CIRCLE=True)}),
+    "full": dict(DATA="full", FIGURE="full_circle_traversals", MODELS={"": {}, "circle": dict(CIRCLE=True)}),
 }
-FREE = {"OUT", "TRAIN", "RESUME", "THREADS", "FIGURE", "SEEDS_FIGURE"}  # change no model
+FREE = {"OUT", "TRAIN", "RESUME", "THREADS", "FIGURE"}  # change no model
 
 
 class Encoder(nn.Module):
@@ -129,11 +126,6 @@ class LabelDecoders(nn.Module):
 
 # ------------------------------------------------ the objective and its training, Eq. 4 and Alg. 1
 
-def log_normal(x, mean, log_var):
-    """log N(x; mean, exp(log_var)), elementwise."""
-    return -0.5 * ((x - mean) ** 2 * torch.exp(-log_var) + log_var + math.log(2 * math.pi))
-
-
 def divergence(mean, log_var, circle):
     """D_KL(q(z | tau, y) || p(z)) of each latent (B, z_dim). p is N(0, 1); of an angle it is uniform over the
     turn, and the noise counts as if it did not wrap, which is 0.1 too little at most."""
@@ -149,7 +141,8 @@ def objective(encoder, decoder, label_decoders, x, one_hot, y):
     x (B, T, x_dim) displacements; the labels as one_hot (B, y_dim), side by side, and as classes y (B, M)."""
     mean, log_var = encoder(x, one_hot)
     z = mean + torch.randn_like(mean) * (0.5 * log_var).exp()  # z ~ q(z | tau, y)
-    states = log_normal(x, *decoder.unroll(z, x.shape[1])).sum((1, 2)).mean()  # sum_t log p(s_t | s_1:t-1, z)
+    step, step_log_var = decoder(z, x.shape[1])  # below: sum_t log p(s_t | s_1:t-1, z)
+    states = -F.gaussian_nll_loss(step, x, step_log_var.exp(), full=True, reduction="sum") / len(x)
     logits = label_decoders(z)
     labels = -sum(F.cross_entropy(logits[m], y[:, m]) for m in range(len(logits)))  # sum_m log p(y^m | z)
     return states, labels, divergence(mean, log_var, decoder.circle).sum(1).mean()
@@ -202,7 +195,7 @@ def check_factors(decoder, names, steps):
     z = torch.randn(5000, n, generator=torch.Generator().manual_seed(0))
     if decoder.circle is not None:
         z[:, decoder.circle] = torch.linspace(-1.5, 1.5, len(z))
-    found = list(factors_of(decoder.unroll(z, steps)[0].double().numpy(), names).values())
+    found = list(factors_of(decoder(z, steps)[0].double().numpy(), names).values())
     with np.errstate(invalid="ignore", divide="ignore"):  # a factor that never changes has no correlation
         corr = np.nan_to_num(np.corrcoef(z.double().numpy().T, found)[:n, n:])  # latents x factors
     best = list(max(itertools.permutations(range(n)), key=lambda order: abs(corr[order, range(n)]).sum()))
@@ -239,13 +232,13 @@ def weak_supervision(dataset, x, settings):
 
 def main():
     config, given = parse_flags(globals())
-    torch.set_num_threads(max(1, THREADS))
+    torch.set_num_threads(THREADS)
     models = {key: config | changes | given for key, changes in MODELS.items()}  # flags override rows
     for key, settings in models.items():
         for name, value in settings.items():
-            least = dict(HIDDEN=1, BATCH=1, EPOCHS=1, LEARNING_RATE=0).get(name, value)
-            if name not in config or value < least:
-                stop(f"{name} = {value} (model {key!r}) is no constant of this file, or below {least}")
+            if name not in config:
+                stop(f"{name} of model {key!r} is no constant of this file")
+            settings[name] = common.convert(value, config[name], f"model {key!r}: {name}")
     if TRAIN:
         dataset = load(OUT, "dataset", DATA, DATA_SEED)
         x = torch.from_numpy(np.diff(dataset["trajectories"], axis=1))  # displacements, App. A.1.2
@@ -283,8 +276,6 @@ def main():
         trained[key]["title"] = f"{kind}\n{weights}"
         measure(key or EXPERIMENT, trained[key])
     draw_traversals(trained)
-    if SEEDS_FIGURE:
-        draw_seeds(trained)
 
 
 # ------------------------------------------------ measuring and drawing: not needed to understand the method
@@ -351,29 +342,15 @@ def draw_traversals(trained):
                 value, t = np.meshgrid(values, range(steps + 1), indexing="ij")
                 dots = ax.scatter(paths[..., 0], value, s=8, c=t, cmap="plasma")
             else:
-                for path, colour in zip(paths, plt.get_cmap(common.TRAVERSAL_MAP)(np.linspace(0, 0.95, 13))):
+                for path, colour in zip(paths, plt.get_cmap("viridis")(np.linspace(0, 0.95, 13))):
                     lines = ax.plot(*path.T, ".-", ms=3, lw=1, color=colour)
                 ax.set_aspect("equal", "datalim")
     if dots:
         figure.legend(*dots.legend_elements(fmt="t = {x:g}"), loc="outside lower center", ncols=9)
     if lines:
-        bar = plt.cm.ScalarMappable(plt.Normalize(-1.5, 1.5), common.TRAVERSAL_MAP)
+        bar = plt.cm.ScalarMappable(plt.Normalize(-1.5, 1.5), "viridis")
         figure.colorbar(bar, ax=axes, label="value of the traversed latent (lines)", aspect=40)
     save_figure(figure, OUT, FIGURE or f"traversals_{EXPERIMENT}")
-
-
-def draw_seeds(trained):
-    """A point for each seed that is trained with the settings of this run."""
-    rows = read_csv(Path(OUT) / "results" / "wetvae.csv")
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.4))
-    for ax, column in zip(axes, ("purity", "abs_corr", "largest_gap_deg")):
-        for k, model in enumerate(trained.values()):
-            mine, names = [row for row in rows if row["settings"] == model["settings"]], model["names"]
-            points = [(names.index(row["factor"]) + 0.2 * k, float(row[column] or "nan")) for row in mine]
-            ax.plot(*zip(*points), ".", label=f"{model['title']}, {len(points) // len(names)} seeds")
-        ax.set(xticks=range(len(names)), xticklabels=names, title=column, ylim=(0, 1.02 * ax.get_ylim()[1]))
-    axes[0].legend(loc="lower left")
-    save_figure(figure, OUT, SEEDS_FIGURE)
 
 
 if __name__ == "__main__":

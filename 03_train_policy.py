@@ -13,8 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
-import common  # before mujoco: it chooses how mujoco renders
-from common import (CORRECTION, MULTI, SINGLE, Actor, Decoder, Robots, SkillDynamics, artifact_name,
+from common import (CORRECTION, MULTI, SINGLE, Actor, Decoder, Robots, artifact_name,  # before mujoco
                     check_same, commands_of, cross_talk, execute, factors_of, first_step, layers, load,
                     load_policy, pack, parse_flags, plt, purity, robot_spec, save, save_figure, stop, unpack,
                     update_csv)
@@ -29,8 +28,7 @@ OUT = "runs"             # folder that everything is written to
 TRAIN = True             # false: only measure and draw what is already trained
 RESUME = False           # true: continue from the last checkpoint
 THREADS = 2              # CPU threads; 1: the robots wait for the updates, with the same result
-CHECKPOINT = 5.0         # minutes between checkpoints
-REPORTS = 20             # printed lines, and points of the learning curve
+REPORTS = 20             # printed lines, points of the learning curve, and checkpoints
 
 METHOD = "wedis"         # wedis, dads or sectar
 DECODER = "main"         # experiment of 02 whose decoder is the reward
@@ -43,13 +41,13 @@ BASE_FRAME = True        # networks read state and command in the base frame (th
 UPDATES = 100_000        # updates of the critics (the paper: 1.92 million)
 ROBOTS = 256             # robots that step together
 EPISODE = 200            # steps until a robot starts anew; not terminal: the value beyond is bootstrapped
-SKILL_STEPS = 50         # steps until a robot is given a new skill
+SKILL_STEPS = 25         # steps until a robot is given a new skill
 WARM_UP = 10_000         # steps with random actions; their statistics normalise the state
-REPLAY = 1_000_000       # size of the replay buffer R, steps
+REPLAY = 1_000_000       # size of the replay buffer R, steps; at least two skills of all robots
 UPDATES_PER_STEP = 8     # updates in each step of all robots
 BATCH = 256              # App. A.1.3
 RELABELLED = 0.5         # share of a batch that is given a fresh skill (hindsight relabelling; the paper: 0)
-CORRECTED = 0.5          # share of skills with a random correction, as the closed loop adds it (the paper: 0)
+CORRECTED = 0.25         # share of skills with a random correction, as the closed loop adds it (the paper: 0)
 
 HIDDEN = 256             # width of the two hidden layers (the paper: 512)
 LEARNING_RATE = 1e-3     # Adam (the paper: 3e-4, fixed)
@@ -81,19 +79,20 @@ NOISY = 16               # noisy starts over which an executed skill is averaged
 STARTS = 400             # noisy starts of the following error
 FIGURE = ""              # name of the figure of skills ("": skills_<experiment>)
 
-SECTAR = dict(METHOD="sectar", Z_DIM=8, RECENT=512_000, MODEL_BATCH=128, REWARD_SCALE=0.3, SINGLE_RUN=(50, 1),
-              MULTI_RUN=(50, 1))
+SECTAR = dict(METHOD="sectar", Z_DIM=8, SKILL_STEPS=50, RECENT=512_000, MODEL_BATCH=128, REWARD_SCALE=0.3,
+              SINGLE_RUN=(50, 1), MULTI_RUN=(50, 1))
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
     "ant_semi": dict(FIGURE="fig05_skills_wedis"),
     "ant_full": dict(DECODER="full_circle", DIRECTIONS=16, FIGURE="fig15_full_circle"),
     "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, BASE_FRAME=False,
+                         VARIANCE_SCALE=0.05, ROBOTS=64, SKILL_STEPS=100, CORRECTED=0.5, DISCOUNT=0.97,
                          Z_RANGE=1.0, MULTI_RUN=(6, 20), FIGURE="fig16_half_cheetah"),
     "ant_world_frame": dict(BASE_FRAME=False),  # the paper's networks: what the base frame is good for
     "ant_dads": dict(METHOD="dads", Z_RANGE=1.0, SKILL_STEPS=200, FIGURE="fig05_skills_dads"),
     "ant_sectar": SECTAR | dict(FIGURE="fig05_skills_sectar"),
     "ant_sectar_no_explorer": SECTAR | dict(EXPLORE=0.0),  # what the explorer is good for
 }
-MAY_DIFFER = ("OUT TRAIN RESUME THREADS CHECKPOINT REPORTS UPDATES DIRECTIONS Z_RANGE SINGLE_RUN MULTI_RUN "
+MAY_DIFFER = ("OUT TRAIN RESUME THREADS REPORTS UPDATES DIRECTIONS Z_RANGE SINGLE_RUN MULTI_RUN "
               "TRAVERSAL NOISY STARTS FIGURE").split()  # from a checkpoint's
 
 
@@ -120,10 +119,6 @@ class Critics(nn.Module):
         return (h * self.weights[2].mT).sum(2) + self.biases[2].squeeze(2)  # a matrix product is slower here
 
 
-def value_network(n_in):
-    return layers(n_in, HIDDEN, 1)
-
-
 class Sac:
     """Actor psi, twin critics, value and target network, with a fixed temperature. average: the policy that
     is kept, a running average of the actor's weights (single ones swing from report to report)."""
@@ -132,7 +127,7 @@ class Sac:
         self.actor = Actor(s_dim, c_dim, a_dim, HIDDEN, BASE_FRAME)
         n_in = self.actor.net[0].in_features
         self.critics = Critics(n_in + a_dim)
-        self.value = value_network(n_in)
+        self.value = layers(n_in, HIDDEN, 1)
         self.target = copy.deepcopy(self.value).requires_grad_(False)
         self.average = copy.deepcopy(self.actor).requires_grad_(False)
         self.critic_adam = adam(self.critics.parameters())
@@ -236,20 +231,22 @@ class Run:
         self.robots = make_robots(ROBOTS, 1)
         self.robots.reset(np.arange(ROBOTS), self.rng)
         s_dim, a_dim = self.robots.observe().shape[1], self.robots.ctrl.shape[1]
-        self.sac = Sac(s_dim, c_dim, a_dim)
+        self.sac = sac = Sac(s_dim, c_dim, a_dim)
         self.model = nn.ModuleDict(model or {})  # what else a baseline learns
         self.adam = adam(self.model.parameters()) if model else None
+        networks = nn.ModuleList([sac.actor, sac.critics, sac.value, sac.target, sac.average, self.model])
+        self.parts = [part for part in (networks, sac.critic_adam, sac.actor_adam, self.adam) if part]
         self.widths = (s_dim, a_dim, s_dim, self.robots.places, z_dim)  # s, a, s', displacement, z
         block = ROBOTS * SKILL_STEPS
-        self.replay = torch.zeros(REPLAY // block * block, sum(self.widths))
+        self.replay = torch.zeros(max(2, REPLAY // block) * block, sum(self.widths))
         self.z = torch.zeros(ROBOTS, z_dim)
         self.age = self.rng.integers(0, EPISODE, ROBOTS)  # each robot changes skills at its own time
         if METHOD == "sectar":
             self.age -= self.age % SKILL_STEPS  # together: trajectories are rows of the replay buffer
-        self.steps, self.unstable, self.seconds = 0, 0, 0.0
-        self.curve, self.losses, self.metric = [], {}, None
+        self.steps, self.seconds = 0, 0.0
+        self.curve, self.losses = [], {}
         self.decoder, self.names, self.config = decoder, names, config
-        self.worker, self.clock, self.last_save = ThreadPoolExecutor(1), time.time(), time.time()
+        self.worker, self.clock = ThreadPoolExecutor(1), time.time()
         if RESUME:
             self.resume()
 
@@ -288,16 +285,15 @@ class Run:
         self.steps += 1
         self.age = (self.age + 1) % EPISODE
         self.robots.reset(np.flatnonzero((self.age == 0) | failed.numpy()), self.rng)
-        self.unstable += int(failed.sum())
         self.seconds += time.time() - self.clock
         updates, every = self.sac.updates, max(1, UPDATES // REPORTS)
+        reported = self.curve[-1]["updates"] if self.curve else 0
         if updates and not all(math.isfinite(value) for value in self.losses.values()):
             last = artifact_name("policy-checkpoint", EXPERIMENT, SEED)
             stop(f"a loss is not finite after {updates} updates: {self.losses}; lower --learning_rate, or go "
                  f"on from the last good {last} with --resume true", code=1)
-        if updates // every > (updates - UPDATES_PER_STEP) // every and updates or updates >= UPDATES:
+        if updates // every > reported // every or updates >= UPDATES:
             self.report()
-        if time.time() - self.last_save > 60 * CHECKPOINT or updates >= UPDATES:
             self.checkpoint()
         self.clock = time.time()
 
@@ -314,9 +310,6 @@ class Run:
                    tracking_error=tracking(policy, False))
         if self.names:
             row["tracking_error_closed"] = tracking(policy, True)
-        if self.metric:
-            with torch.random.fork_rng():  # measuring leaves the training as it is
-                row["metric"] = self.metric()
         row |= self.losses
         self.curve.append(row)
         left = self.seconds / 60 * (UPDATES / self.sac.updates - 1)
@@ -324,33 +317,25 @@ class Run:
         speed = self.sac.updates / self.seconds
         print(*text, f"{speed:.0f} updates/s", f"{left:.1f} min left", sep="  ", flush=True)
 
-    def parts(self):
-        sac = self.sac
-        networks = nn.ModuleList([sac.actor, sac.critics, sac.value, sac.target, sac.average, self.model])
-        return [part for part in (networks, sac.critic_adam, sac.actor_adam, self.adam) if part]
-
     def checkpoint(self):
-        robots = {name: torch.from_numpy(self.robots.batch.bind(name).copy())
-                  for name in ("qpos", "qvel", "ctrl", "time", "qacc_warmstart")}
-        save(OUT, "policy-checkpoint", EXPERIMENT, SEED, self.config, robots=robots, z=self.z,
-             parts=[part.state_dict() for part in self.parts()], curve=self.curve,
+        save(OUT, "policy-checkpoint", EXPERIMENT, SEED, self.config, z=self.z,
+             robots=torch.from_numpy(self.robots.batch.state.copy()),
+             parts=[part.state_dict() for part in self.parts], curve=self.curve,
              replay=self.replay[:self.steps * ROBOTS].clone(), age=torch.from_numpy(self.age),
-             numbers=[self.sac.updates, self.steps, self.unstable, self.seconds],
+             numbers=[self.sac.updates, self.steps, self.seconds],
              torch_rng=torch.get_rng_state(), numpy_rng=self.rng.bit_generator.state)
-        self.last_save = time.time()
 
     def resume(self):
         if not (Path(OUT) / artifact_name("policy-checkpoint", EXPERIMENT, SEED)).exists():
             return print("there is no checkpoint yet: training from the beginning")
         state = load(OUT, "policy-checkpoint", EXPERIMENT, SEED)
         check_same(state, self.config, MAY_DIFFER)
-        for part, saved in zip(self.parts(), state["parts"]):
+        for part, saved in zip(self.parts, state["parts"]):
             part.load_state_dict(saved)
         self.replay[:len(state["replay"])] = state["replay"]
         self.z, self.age, self.curve = state["z"], state["age"].numpy(), state["curve"]
-        self.sac.updates, self.steps, self.unstable, self.seconds = state["numbers"]
-        for name, values in state["robots"].items():
-            self.robots.batch.bind(name)[:] = values.numpy()
+        self.sac.updates, self.steps, self.seconds = state["numbers"]
+        self.robots.batch.state[:] = state["robots"].numpy()
         torch.set_rng_state(state["torch_rng"])
         self.rng.bit_generator.state = state["numpy_rng"]
 
@@ -361,18 +346,14 @@ def calibrate_relation(decoder, names, steps):
     """Alg. 1, "Test: find relation functions": for each factor of z_multi the weight with which single steps,
     changed by the relation function (common.next_skill), come nearest to the decoder's free run of `steps`.
     Returns {factor: weight} and prints how far the two are apart (RMS, as a share of the RMS step)."""
-    def apart(z, factor, weight):
-        chain = commands_of(as_policy(None, decoder, names, {factor: weight}), z, steps)
-        free = decoder(z, steps)[0]
-        return ((chain - free).square().mean() / free.square().mean()).sqrt().item()
-
-    grid = torch.linspace(-Z_RANGE, Z_RANGE, 13)
-    relation = {}
+    grid, relation = torch.linspace(-Z_RANGE, Z_RANGE, 13), {}
     for factor in [name for name in names if name in MULTI]:
         z = torch.zeros(len(grid) ** 2, len(names))  # direction 0: it stays within what 02 trains on
         z[:, [names.index("speed"), names.index(factor)]] = torch.cartesian_prod(grid, grid)
-        weights = np.linspace(-1, 1, 401).round(4).tolist()
-        errors = {weight: apart(z, factor, weight) for weight in weights}
+        free, errors = decoder(z, steps)[0], {}
+        for weight in np.linspace(-1, 1, 401).round(4).tolist():
+            chain = commands_of(as_policy(None, decoder, names, {factor: weight}), z, steps)
+            errors[weight] = ((chain - free).square().mean() / free.square().mean()).sqrt().item()
         best = relation[factor] = min(errors, key=errors.get)
         print(f"relation function of {factor}: weight {best:+.3f}, {errors[best]:.1%} from the decoder's "
               f"free run ({errors[0.0]:.1%} without it)")
@@ -380,7 +361,8 @@ def calibrate_relation(decoder, names, steps):
 
 
 def as_policy(actor, decoder, names, relation):
-    return SimpleNamespace(actor=actor, decoder=decoder, names=names, relation=relation, scale=STEP_SCALE)
+    return SimpleNamespace(actor=actor, decoder=decoder, names=names, relation=relation, scale=STEP_SCALE,
+                           method=METHOD)
 
 
 # ---------------------------------------------------------------- main
@@ -398,20 +380,19 @@ def main():
         run = Run(z_dim + decoder.x_dim, decoder.x_dim, decoder, names, config)
         train_wedis(run, decoder)
     elif TRAIN:
-        run = make_baseline(config)
-        decoder, names, relation = run.decoder, [], {}
+        decoder, names, relation = Decoder(Z_DIM, 2, 64), [], {}
+        model = dict(decoder=decoder)
+        if METHOD == "sectar":
+            model["encoder"] = layers(2 * SKILL_STEPS, 64, 2 * Z_DIM)
+        run = Run(Z_DIM, Z_DIM if METHOD == "dads" else 2, decoder, names, config, model)
         dict(dads=train_dads, sectar=train_sectar)[METHOD](run)
     if TRAIN:
         save(OUT, "policy", EXPERIMENT, SEED, config, actor=pack(run.sac.average), decoder=pack(decoder),
              method=METHOD, robot=ROBOT, names=names, relation=relation, scale=STEP_SCALE,
              length=source["length"], curve=run.curve, updates=run.sac.updates,
              env_steps=run.steps * ROBOTS, seconds=run.seconds)
-        if run.unstable:
-            print(f"{run.unstable} steps were unstable in MuJoCo: left out, their robots started anew")
     policy = load_policy(OUT, EXPERIMENT, SEED)
-    if (policy.method, policy.robot, policy.scale) != (METHOD, ROBOT, STEP_SCALE):
-        stop(f"{artifact_name('policy', EXPERIMENT, SEED)} was trained with --method {policy.method} --robot "
-             f"{policy.robot} --step_scale {policy.scale}; give the same, or train anew")
+    check_same(vars(policy), config, MAY_DIFFER)
     measure(policy, source["ranges"])
     draw_skills(policy)
     draw_robots()
@@ -421,77 +402,51 @@ def check_constants(decoder, names):
     """Whatever makes no sense ends here, before training, with what fits."""
     if METHOD not in ("wedis", "dads", "sectar") or ROBOT not in ("ant", "half_cheetah"):
         stop("--method is wedis, dads or sectar; --robot is ant or half_cheetah")
-    if METHOD != "wedis" and ROBOT != "ant" or METHOD == "sectar" and Z_DIM < 3:
-        stop("DADS and SeCTAR learn on the Ant alone: --robot ant; SeCTAR's --z_dim is at least 3")
-    if METHOD == "dads" and BASE_FRAME and Z_DIM != 2:
-        stop("the base frame turns a skill of DADS as two numbers: --z_dim 2, or --base_frame false")
-    if names[0] != "speed" or not set(names) <= set(SINGLE + MULTI):
-        stop(f"the decoder {DECODER} has axes {' '.join(names)}; a policy needs speed, and may have "
-             "direction, curvature, acceleration: choose another --decoder")
-    if decoder.x_dim != make_robots(1, 1).places:
-        stop(f"the decoder {DECODER} predicts {decoder.x_dim} coordinates, which do not fit the {ROBOT}: "
-             "choose another --decoder or --robot")
-    if BASE_FRAME and ROBOT != "ant":
-        stop("only a robot in the plane has a base frame: --base_frame false")
-    for name in ("UPDATES ROBOTS EPISODE SKILL_STEPS WARM_UP REPLAY BATCH UPDATES_PER_STEP HIDDEN "
-                 "ACTOR_EVERY THREADS REPORTS Z_DIM RECENT MODEL_BATCH PRIOR_SAMPLES DIRECTIONS TRAVERSAL "
-                 "NOISY STARTS SINGLE_RUN MULTI_RUN").split():
-        if any(value < 1 or value % 1 for value in np.atleast_1d(globals()[name])):
-            stop(f"--{name.lower()} must be whole and above 0")
+    if ROBOT != "ant" and (BASE_FRAME or METHOD != "wedis"):
+        stop(f"the {ROBOT} runs on a rail: --base_frame false; DADS and SeCTAR learn with --robot ant alone")
+    if METHOD == "sectar" and Z_DIM < 3 or METHOD == "dads" and BASE_FRAME and Z_DIM != 2:
+        stop("SeCTAR's --z_dim is at least 3; DADS needs --z_dim 2, or --base_frame false")
+    known = names[0] == "speed" and set(names) <= set(SINGLE + MULTI)
+    if not known or decoder.x_dim != make_robots(1, 1).places:
+        stop(f"the decoder {DECODER} has axes {' '.join(names)} and predicts {decoder.x_dim} coordinates, "
+             f"which does not fit the {ROBOT}: choose another --decoder or --robot")
     for name in "STEP_SCALE VARIANCE_SCALE LEARNING_RATE FLOOR_START FLOOR_END Z_RANGE".split():
         if globals()[name] <= 0:
             stop(f"--{name.lower()} must be above 0")
     if DISCOUNT >= 1 or max(RELABELLED, CORRECTED, EXPLORE, AVERAGED, SMOOTHING, DECAY_FROM) > 1:
         stop("--discount is below 1; shares and rates are at most 1")
-    block = ROBOTS * SKILL_STEPS
-    if EPISODE % SKILL_STEPS or REPLAY < max(WARM_UP, 2 * block) or METHOD == "sectar" and WARM_UP < block:
-        stop(f"--skill_steps must divide --episode; --replay is at least --warm_up and {2 * block} (two "
-             f"skills of all robots); for SeCTAR --warm_up is at least {block}")
+    if EPISODE % SKILL_STEPS or not all(isinstance(n, int) and n > 0 for n in SINGLE_RUN + MULTI_RUN):
+        stop("--skill_steps must divide --episode; --single_run and --multi_run are whole and above 0")
 
 
 # ================================================================ Baselines: not needed to understand WEDIS
 
-def make_baseline(config):
-    """The Run of DADS or SeCTAR, with the networks that it learns beside the policy."""
-    if METHOD == "dads":
-        dynamics = SkillDynamics(Z_DIM)
-        return Run(Z_DIM, Z_DIM, dynamics, [], config, dict(decoder=dynamics))
-    decoder = Decoder(Z_DIM, 2, 64)
-    return Run(Z_DIM, 2, decoder, [], config, dict(decoder=decoder, encoder=TrajectoryEncoder()))
-
-
 def train_dads(run):
     """Sharma et al. 2019: skills z ~ U(-1, 1)^2; a step is worth its mutual information with z under the
-    skill dynamics q(displacement | z), which learn too. It is computed with the q of now: old steps count."""
+    skill dynamics q(displacement | z), a Gaussian (theirs: four), which learn too. Old steps count: it is
+    computed with the q of now."""
     q = run.decoder
 
-    def log_q(displacement, log_weight, mean):
-        """log q: displacement (B, 2) under its own mixture -> (B,); (B, 1, 2) under all L ones -> (B, L)."""
-        x = (displacement / STEP_SCALE - q.x_mean) / q.x_std
-        square = (x[..., None, :] - mean).square().sum(-1)
-        return (log_weight - 0.5 * square).logsumexp(-1) - math.log(2 * math.pi)
+    def log_q(displacement, z):
+        """log q up to a constant: displacement (B, 2), own z (B, 2) -> (B,); (B, 1, 2), (L, 2) -> (B, L)."""
+        mean, log_var = (v[:, 0] for v in q(z, 1))
+        variance = log_var.exp().clamp(min=(FLOOR_END / STEP_SCALE) ** 2)  # or likelihoods have no bound
+        return -0.5 * (variance.log() + (displacement / STEP_SCALE - mean) ** 2 / variance).sum(-1)
 
     @torch.no_grad()
     def information(displacement, z):
         """log(L + 1) - log(1 + sum_i exp(log q(.|z_i) - log q(.|z))), (B,); one set of L for the batch."""
-        own = log_q(displacement, *q.mixture(z))
-        others = log_q(displacement[:, None], *q.mixture(torch.rand(PRIOR_SAMPLES, Z_DIM) * 2 - 1))
+        own = log_q(displacement, z)
+        others = log_q(displacement[:, None], torch.rand(PRIOR_SAMPLES, Z_DIM) * 2 - 1)
         return math.log(PRIOR_SAMPLES + 1) - (1 + (others - own[:, None]).clamp(-50, 50).exp().sum(1)).log()
 
-    def metric():
-        _, _, _, displacement, z = run.sample(4096, RECENT)
-        return information(displacement, z).mean().item()
-
-    run.metric = metric
     while run.sac.updates < UPDATES:
         run.renew(torch.rand(ROBOTS, Z_DIM) * 2 - 1)
         run.act(run.z)
         if run.warm():
             # from recent steps and their own skills: from relabelled ones q learns that z means nothing
             _, _, _, displacement, z = run.sample(MODEL_BATCH, RECENT)
-            q.x_mean.lerp_(displacement.mean(0) / STEP_SCALE, 0.02)
-            q.x_std.lerp_(displacement.std(0) / STEP_SCALE, 0.02)
-            loss = -log_q(displacement, *q.mixture(z)).mean()
+            loss = -log_q(displacement, z).mean()
             run.adam.zero_grad()
             loss.backward()
             run.adam.step()
@@ -508,18 +463,6 @@ def train_dads(run):
         run.collect()
 
 
-class TrajectoryEncoder(nn.Module):
-    """q_phi(z | tau) of SeCTAR: a bidirectional LSTM over (B, T, 2). Returns mean, log-variance."""
-
-    def __init__(self, hidden=64):
-        super().__init__()
-        self.lstm = nn.LSTM(2, hidden, bidirectional=True, batch_first=True)
-        self.head = nn.Linear(2 * hidden, 2 * Z_DIM)
-
-    def forward(self, x):
-        return self.head(self.lstm(x)[0].mean(1)).chunk(2, 1)
-
-
 EXPLORER = 3.0  # last entry of the z of SeCTAR's explorer: far from N(0, I), and no plan asks for it
 
 
@@ -531,7 +474,7 @@ def train_sectar(run):
 
     def elbo(x):
         """x (B, T, 2), trajectory units -> sum_t log p(x_t | z), KL(q || p), (B,), and means (B, T, 2)."""
-        mean, log_var = encoder(x)
+        mean, log_var = encoder(x.flatten(1)).chunk(2, 1)  # theirs: a bidirectional LSTM
         kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1)
         decoded, variance = decoder(mean + (0.5 * log_var).exp() * torch.randn_like(mean), SKILL_STEPS)
         variance = variance.exp().clamp(min=(FLOOR_END / STEP_SCALE) ** 2)  # or likelihoods have no bound
@@ -549,13 +492,6 @@ def train_sectar(run):
         """Commands (B, T, 2) of skills and explorers alike."""
         return torch.where(z[:, None, -1:] == EXPLORER, z[:, None, :2].expand_as(decoded), decoded)
 
-    @torch.no_grad()
-    def metric():
-        x = run.replay[trajectories(512, RECENT)].split(run.widths, 2)[3] / STEP_SCALE
-        path, decoded = x.cumsum(1), decoder(encoder(x)[0], SKILL_STEPS)[0].cumsum(1)
-        return ((decoded - path).square().mean() / path.square().mean()).sqrt().item()  # reconstruction error
-
-    run.metric = metric
     while run.sac.updates < UPDATES:
         z = torch.randn(ROBOTS, Z_DIM)
         explorers = torch.rand(ROBOTS) < EXPLORE
@@ -565,7 +501,7 @@ def train_sectar(run):
         with torch.no_grad():
             commands = steps_of(run.z, decoder(run.z, SKILL_STEPS)[0])
         run.act(commands[:, run.steps % SKILL_STEPS])
-        if run.warm():
+        if run.warm() and run.steps >= SKILL_STEPS:
             _, _, _, x, z = run.replay[trajectories(MODEL_BATCH, RECENT)].split(run.widths, 2)
             mine = (z[:, 0, -1] == EXPLORER) | (EXPLORE == 0)
             log_p, kl, _ = elbo(x / STEP_SCALE)
@@ -575,26 +511,22 @@ def train_sectar(run):
             run.adam.step()
 
             run.sac.schedule(run.sac.updates / UPDATES)
-            share = min(16, SKILL_STEPS)  # steps of each trajectory in the batch: decoded once
-            rows = trajectories(max(1, UPDATES_PER_STEP * BATCH // share), len(run.replay))
-            t = torch.randint(SKILL_STEPS, (len(rows), share))
-            x = run.replay[rows].split(run.widths, 2)[3] / STEP_SCALE
-            z = run.replay[rows[:, 0]].split(run.widths, 1)[4]
+            rows = trajectories(max(1, UPDATES_PER_STEP * BATCH // SKILL_STEPS), len(run.replay))
+            s, a, s2, x, z = run.replay[rows].split(run.widths, 2)
+            x, z = x / STEP_SCALE, z[:, 0]
             explorer = z[:, -1] == EXPLORER
             fresh = (torch.rand(len(z)) < RELABELLED) & ~explorer
             z[fresh] = torch.randn(int(fresh.sum()), Z_DIM)
             with torch.no_grad():
-                decoded = decoder(z, SKILL_STEPS)[0]
-                decoded[explorer] = elbo(x[explorer])[2] if explorer.any() else decoded[explorer]
+                decoded = torch.where(explorer[:, None, None], elbo(x)[2], decoder(z, SKILL_STEPS)[0])
                 # Laplace likelihood of the place where a trajectory ends, shared among its steps. The trap:
                 # judged by single steps, a skill is paid for not trembling, which is standing still
                 miss = x - decoded
-                away = (miss * nn.functional.normalize(miss.sum(1))[:, None]).sum(2).gather(1, t)
-                r = REWARD_SCALE * torch.where(explorer[:, None], away, -away).flatten()
-                commands, i = steps_of(z, decoded), torch.arange(len(rows))[:, None]
-                c = commands[i, t].flatten(0, 1)
-                c2 = commands[i, (t + 1).clamp(max=SKILL_STEPS - 1)].flatten(0, 1)
-                s, a, s2, _, _ = run.replay[rows.gather(1, t).flatten()].split(run.widths, 1)
+                away = (miss * nn.functional.normalize(miss.sum(1))[:, None]).sum(2)
+                r = REWARD_SCALE * torch.where(explorer[:, None], away, -away)
+                c = steps_of(z, decoded)
+                c2 = torch.cat([c[:, 1:], c[:, -1:]], 1)
+                s, a, s2, r, c, c2 = (v.flatten(0, 1) for v in (s, a, s2, r, c, c2))
                 x, x2 = run.sac.actor.inputs(s, c), run.sac.actor.inputs(s2, c2)
             order = torch.randperm(len(x))
             for batch in zip(*(v[order].split(BATCH) for v in (x, a, x2, r))):
@@ -626,7 +558,7 @@ def grid(policy):
     if policy.decoder.x_dim == 1:
         z = torch.linspace(-Z_RANGE, Z_RANGE, 8)[:, None]
     else:
-        circle = METHOD == "wedis" and policy.decoder.circle is not None  # its two ends are one direction
+        circle = policy.decoder.circle is not None  # its two ends are one direction
         directions = torch.linspace(-Z_RANGE, Z_RANGE, DIRECTIONS + circle)[:DIRECTIONS]
         z = torch.cartesian_prod(torch.linspace(-Z_RANGE, Z_RANGE, 5), directions)
     return nn.functional.pad(z, (0, (len(policy.names) or Z_DIM) - z.shape[1]))
@@ -638,11 +570,11 @@ def roll_out(policy, z, run, closed, noise=None, run_in=0):
     robots = make_robots(len(z), THREADS)
     if noise is not None:
         robots.reset(np.arange(len(z)), np.random.default_rng(noise))
-    commands = commands_of(policy, z, int(run[0]))
+    commands = commands_of(policy, z, run[0])
     for _ in execute(policy, robots, commands[:, :1], run_in, closed, True):
         pass
     places = [robots.place()]
-    for _ in execute(policy, robots, commands, int(run[1]), closed, True):
+    for _ in execute(policy, robots, commands, run[1], closed, True):
         places.append(robots.place())
     return torch.stack(places, 1).numpy()
 
@@ -650,7 +582,7 @@ def roll_out(policy, z, run, closed, noise=None, run_in=0):
 def predicted_path(policy, z, run):
     """The decoder's free run of T transitions, each H_z steps long: places (n, T + 1, 2 or 1) in metres."""
     with torch.no_grad():
-        path = run[1] * policy.scale * policy.decoder(z, int(run[0]))[0].cumsum(1)
+        path = run[1] * policy.scale * policy.decoder(z, run[0])[0].cumsum(1)
     return nn.functional.pad(path, (0, 0, 1, 0)).numpy()
 
 
@@ -673,9 +605,9 @@ def following(policy, closed):
         z = torch.from_numpy(rng.uniform(-Z_RANGE, Z_RANGE, (STARTS, len(policy.names)))).float()
         if "direction" in policy.names:
             z[:, 0].abs_()  # no slow skills, App. A.1.4; on a rail the sign of the speed is the direction
-        commands = commands_of(policy, z, int(MULTI_RUN[0]))
+        commands = commands_of(policy, z, MULTI_RUN[0])
         predicted = robots.place() + MULTI_RUN[1] * policy.scale * commands.sum(1)
-        for _ in execute(policy, robots, commands, int(MULTI_RUN[1]), closed, True):
+        for _ in execute(policy, robots, commands, MULTI_RUN[1], closed, True):
             fallen |= robots.upside_down()
         away.append((robots.place() - predicted).norm(dim=1).numpy())
     return dict(follow_median_m=float(np.median(away)), follow_p90_m=float(np.quantile(away, 0.9)),
@@ -685,10 +617,10 @@ def following(policy, closed):
 def executed_cross_talk(policy, ranges, closed):
     """Cross-talk C (axes, factors) of executed skills, the mean over noisy starts, per fifth of a skill."""
     values, curves = np.linspace(-Z_RANGE, Z_RANGE, TRAVERSAL), []
-    every = max(1, int(MULTI_RUN[0] * MULTI_RUN[1]) // 5)
+    every = max(1, MULTI_RUN[0] * MULTI_RUN[1] // 5)
     for axis in range(len(policy.names)):
         z = traversal(policy, axis, values).repeat(NOISY, 1)
-        places = roll_out(policy, z, MULTI_RUN, closed, noise=SEED + 1, run_in=int(MULTI_RUN[1]))[:, ::every]
+        places = roll_out(policy, z, MULTI_RUN, closed, noise=SEED + 1, run_in=MULTI_RUN[1])[:, ::every]
         steps = np.diff(places, axis=1).reshape(NOISY, TRAVERSAL, places.shape[1] - 1, -1).mean(0)
         curves.append(factors_of(steps / (every * policy.scale), list(ranges)))
     return cross_talk(curves, ranges)
@@ -706,8 +638,6 @@ def measure(policy, ranges):
             row |= {name + end: value for name, value in following(policy, closed).items()}
             C = executed_cross_talk(policy, ranges, closed)
             row |= {f"purity_{name}{end}": purity(C, i, i) for i, name in enumerate(policy.names)}
-    else:
-        row["metric"] = policy.curve[-1]["metric"]
     for name, value in row.items():
         print(f"{name:24} {value if isinstance(value, str) else round(value, 3)}")
     update_csv(Path(OUT) / "results" / "policies.csv", [row], ("experiment", "seed"))
@@ -719,39 +649,31 @@ def draw_skills(policy):
     names = policy.names or [str(i + 1) for i in range(Z_DIM)]
     rows = ("predicted", "executed, open loop", "executed, closed loop")[:2 + bool(policy.names)]
     rail = policy.decoder.x_dim == 1
-    size = 3.0 if len(names) < 5 else 2.0
     figure, axes = plt.subplots(len(rows), len(names), squeeze=False,
-                                figsize=(size * len(names) + 1, size * len(rows)))
+                                figsize=(2.8 * len(names) + 1, 2.8 * len(rows)))
     for i, name in enumerate(names):
         run = MULTI_RUN if rail or name in MULTI else SINGLE_RUN
-        values, colours = np.array(list(common.LATENT_COLOURS)), list(common.LATENT_COLOURS.values())
-        if rail:
-            values = np.linspace(-1, 1, 9)
-        elif name == "direction" and policy.decoder.circle is not None:
+        values = np.linspace(-1, 1, 9 if rail else 5)
+        colours = ["#D55E00", "#009E73", "#0072B2", "#56B4E9", "#F0E442"]  # the paper's, for the colour-blind
+        if name == "direction" and policy.decoder.circle is not None:
             values = np.linspace(-1.5, 1.5, DIRECTIONS + 1)[:-1]
             colours = plt.get_cmap("twilight")(np.linspace(0.1, 0.9, DIRECTIONS))
         z = traversal(policy, i, values)
         paths = [predicted_path(policy, z, run)]
         paths += [roll_out(policy, z, run, closed) for closed in (False, True)[:len(rows) - 1]]
-        places = np.concatenate([path.reshape(-1, path.shape[2]) for path in paths])
-        low, high = places.min(0), places.max(0)
-        reach = 0.6 * (high - low).max() + 0.01  # one scale for all rows of a column
-        limits = [(middle - reach, middle + reach) for middle in (low + high) / 2]
+        reach = 1.05 * max(abs(path).max() for path in paths)  # one scale for all rows of a column
         for ax, path in zip(axes[:, i], paths):
-            ax.set_xlim(limits[0])
-            marks = path[:, ::1 if path is paths[0] else int(run[1])]
+            ax.set_xlim(-reach, reach)
+            marks = path[:, ::1 if path is paths[0] else run[1]]
             if rail:
                 for t, colour in enumerate(plt.get_cmap("plasma")(np.linspace(0, 0.85, marks.shape[1]))):
                     ax.plot(marks[:, t, 0], values, ".", color=colour, label=f"t = {t}")
                 continue
-            ax.set(ylim=limits[1], aspect="equal")
+            ax.set(ylim=(-reach, reach), aspect="equal")
             for line, dots, value, colour in zip(path, marks, values, colours):
                 ax.plot(*line.T, color=colour, lw=1.3, label=f"{value:g}")
                 ax.plot(*dots.T, "o", ms=3 if len(dots) < 10 else 0, color=colour)
-        title = f"$z_{{{name}}}$, $T$ = {int(run[0])}, $H_z$ = {int(run[1])}"
-        if len(values) > 9:
-            title += f"\n{len(values)} latents from {values[0]:g} (pale blue) to {values[-1]:g}"
-        axes[0, i].set_title(title)
+        axes[0, i].set_title(f"$z_{{{name}}}$, $T$ = {run[0]}, $H_z$ = {run[1]}")
         axes[-1, i].set_xlabel("x (m)")
     for ax, text in zip(axes[:, 0], rows):
         ax.set_ylabel(f"{text}\n{'latent' if rail else 'y (m)'}")

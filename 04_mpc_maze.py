@@ -9,6 +9,7 @@ and 4.4 m (sparse) as printed; 1.1, 0.8, 3.6, 3.5 m in closed loop. The start is
 import hashlib
 import io
 import logging
+import signal
 import time
 from functools import cache, partial
 from itertools import product
@@ -43,13 +44,12 @@ TRIALS = 50                 # of each configuration (the paper: 10)
 EPISODE = 600               # H_E, environment steps
 HOLD = 40                   # H_z, environment steps for which z_single is held
 LENGTH = 5                  # T, transitions of a skill
-PLANNED_DENSE = 3           # H_P, skills planned ahead, dense reward
-PLANNED_SPARSE = 3          # H_P, sparse reward: to the end of the episode
+PLANNED = 3                 # H_P, skills planned ahead, dense reward; sparse: to the end of the episode
 Z_RANGE = 1.5               # skills ~ U(-Z_RANGE, Z_RANGE), but speed ~ U(0, Z_RANGE): slow is useless here
 
 # Planning, App. A.1.4
 SAMPLES = "1000"            # N, sequences of skills per plan; one or more numbers
-LOOK_AHEAD = "0"            # steps to plan ahead, one or more numbers; 0: Table 2's H_P
+LOOK_AHEAD = ""             # steps to plan ahead, one or more numbers ("": Table 2's H_P)
 POOL = 65536                # skills are drawn from so many, decoded once (the paper does not say)
 PENALTY = 100.0             # w_p, for each transition of a plan that collides
 REWARD = 5.0                # w_r, sparse reward
@@ -59,13 +59,11 @@ GOAL = (24.0, 12.0)         # x and y, metres; the Ant starts at (0, 0), 26.8 m 
 
 METHODS = {  # Table 2; a row wins over a maze's, or a maze would give a scale to WEDIS-NTS
     "wedis": {},
-    "wedis_s": dict(MODES="printed", LENGTH=1, PLANNED_DENSE=4, PLANNED_SPARSE=15),  # single steps
-    "wedis_nts": dict(MODES="printed", HOLD=1, LENGTH=20, PLANNED_DENSE=4, PLANNED_SPARSE=30),  # no scaling
+    "wedis_s": dict(MODES="printed", LENGTH=1, PLANNED=4),            # single steps
+    "wedis_nts": dict(MODES="printed", HOLD=1, LENGTH=20, PLANNED=4),  # no trajectory scaling
     # App. A.1.4 gives DADS U(-1, 1), as it is trained, and SeCTAR U(-1.5, 1.5); Table 2 swaps the two.
-    "dads": dict(MODES="printed", POLICY="ant_dads", EPISODE=300, HOLD=20, LENGTH=1, PLANNED_DENSE=4,
-                 PLANNED_SPARSE=15, Z_RANGE=1.0),
-    "sectar": dict(MODES="printed", POLICY="ant_sectar", HOLD=1, LENGTH=40, PLANNED_DENSE=4,
-                   PLANNED_SPARSE=15),
+    "dads": dict(MODES="printed", POLICY="ant_dads", EPISODE=300, HOLD=20, LENGTH=1, PLANNED=4, Z_RANGE=1.0),
+    "sectar": dict(MODES="printed", POLICY="ant_sectar", HOLD=1, LENGTH=40, PLANNED=4),
 }
 EXPERIMENTS = {  # a row names the constants in which an experiment differs; its name is that of its CSV
     "mazes": {},
@@ -82,9 +80,9 @@ MAZE = {  # walls, and the constants in which a maze differs; plan a row of your
     "maze2": dict(WALLS=HULL + [(7, 8, 4, 18), (16, 17, -6, 8)]),  # Z; the trap is at the bottom right
     "s_maze": dict(WALLS=[(-7, -6, -13, 13), (45, 46, -13, 13), (-7, 46, -13, -12), (-7, 46, 12, 13),
                           (9, 10, -12, -0.5), (28, 29, 0.5, 12)],  # Fig 18: over one wall, under the next
-                   GOAL=(38.0, 0.0), HOLD=50, LENGTH=6, PLANNED_DENSE=2, PLANNED_SPARSE=2, EPISODE=600),
+                   GOAL=(38.0, 0.0), HOLD=50, LENGTH=6, PLANNED=2, EPISODE=600),
     "obstacles": dict(WALLS=HULL + [(7, 9, 2.5, 4.5), (13, 15, 10, 12), (12, 14, 0, 2), (2, 4, 7, 9)],
-                      GOAL=(17.0, 8.0), HOLD=50, LENGTH=5, PLANNED_DENSE=1, PLANNED_SPARSE=1, EPISODE=250),
+                      GOAL=(17.0, 8.0), HOLD=50, LENGTH=5, PLANNED=1, EPISODE=250),
     "open": dict(WALLS=[]),
 }
 
@@ -98,12 +96,11 @@ def skill_pool(u):
     trajectory units. Printed: the decoder's mean for T free steps; closed: the commands."""
     high = torch.full((u.policy.decoder.arguments[0],), u.z_range)
     low = -high
-    if "speed" in u.policy.names:  # the paper: U(-1.5, 0), for its axis points the other way
-        low[u.policy.names.index("speed")] = 0
+    if u.policy.names:  # speed is the first axis; the paper: U(-1.5, 0), for its axis points the other way
+        low[0] = 0
     z = low + (high - low) * torch.rand(u.pool, len(low))
-    if u.mode == "closed":
-        return z, torch.cat([commands_of(u.policy, part, u.length) for part in z.split(8192)])
-    return z, torch.cat([u.policy.decoder(part, u.length)[0] for part in z.split(8192)])
+    predict = partial(commands_of, u.policy) if u.mode == "closed" else lambda *z_t: u.policy.decoder(*z_t)[0]
+    return z, torch.cat([predict(part, u.length) for part in z.split(8192)])
 
 
 def scaled_path(state, delta, scale):
@@ -145,7 +142,7 @@ def run(u):
     skills = u.episode // skill_steps
     cases = []
     for kind, samples, steps in product(u.rewards, u.samples, u.look_ahead):
-        planned = u.planned_sparse if kind == "sparse" else u.planned_dense
+        planned = skills if kind == "sparse" else u.planned  # App. A.1.4
         if steps:
             planned = max(1, steps // skill_steps)
         cases.append((kind, samples, min(planned, skills)))
@@ -154,7 +151,6 @@ def run(u):
     robots = common.Robots(maze_spec(u), len(trials), THREADS)  # an unstable one starts anew at the origin
     for first in range(0, len(trials), u.trials):  # every case has the same starts
         robots.reset(np.arange(first, first + u.trials), np.random.default_rng(u.seed))
-    touch, contacts = robots.batch.bind("sensordata"), np.zeros(len(trials), int)
     torch.manual_seed(u.seed)
     pool, closed, poses = skill_pool(u), u.mode == "closed", [robots.qpos.copy()]
     for i in range(skills):                                                 # line 1
@@ -168,20 +164,18 @@ def run(u):
             chosen.append(z)
         commands = commands_of(u.policy, torch.stack(chosen), u.length)     # lines 17 and 18
         for _ in execute(u.policy, robots, commands, u.hold, closed, deterministic=closed):  # lines 13 to 19
-            contacts += touch[:, 0] > 0
             poses.append(robots.qpos.copy())                                # line 20
 
     rows = []
     for n, t in enumerate(trials):
         t.poses = np.stack([pose[n] for pose in poses])
         distance = np.linalg.norm(t.poses[:, :2] - u.goal, axis=1)
-        length = np.linalg.norm(np.diff(t.poses[:, :2], axis=0), axis=1).sum()
         rows.append(dict(
             maze=u.maze, reward=t.reward, method=u.method, mode=u.mode, look_ahead=t.planned * skill_steps,
             samples=t.samples, trial=t.trial, seed=u.seed, final_distance=distance[-1],
-            min_distance=distance.min(), success=int(distance[-1] < u.epsilon), contacts=contacts[n],
-            path_length=length, planning_ms=1e3 * t.time / skills, policy_seed=u.policy_seed,
-            policy=u.policy.sha256[:8], settings=u.settings))
+            min_distance=distance.min(), success=int(distance[-1] < u.epsilon),
+            planning_ms=1e3 * t.time / skills, policy_seed=u.policy_seed, policy=u.policy.sha256[:8],
+            settings=u.settings))
     return rows, [t for t in trials if t.trial < 3]
 
 
@@ -210,7 +204,7 @@ def main():
 
 
 def maze_spec(u):
-    """The Ant between real walls 1 m high, a sensor of their contacts, and the goal as a red disc."""
+    """The Ant between real walls 1 m high, and the goal as a red disc."""
     spec = common.robot_spec("ant")
     maze = spec.worldbody.add_body(name="maze")
     for x0, x1, y0, y1 in u.walls:
@@ -218,9 +212,6 @@ def maze_spec(u):
                       size=[(x1 - x0) / 2, (y1 - y0) / 2, 0.5], rgba=[0.45, 0.5, 0.6, 1])
     spec.worldbody.add_site(pos=[*u.goal, 0.1], type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.8, 0.1, 0],
                             rgba=[0.85, 0.2, 0.1, 1])
-    spec.add_sensor(type=mujoco.mjtSensor.mjSENS_CONTACT, intprm=[1, 0, 1],  # the first 1: how many contacts
-                    objtype=mujoco.mjtObj.mjOBJ_BODY, objname="maze",
-                    reftype=mujoco.mjtObj.mjOBJ_XBODY, refname="torso")  # and all that hangs on it
     return spec
 
 
@@ -256,6 +247,7 @@ def drive(u):
     hand = SimpleNamespace(mode="start again", closed=True, text="", geoms=[],  # both threads use it
                            z={"z_" + name: 0.0 for name in u.policy.names})
     asked, steps, start, pages = None, 0, time.monotonic(), []
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends it below
     try:
         from mujoco.studio import launch_web, messages, plugin, viewer_protocol, web_viewer
         from mujoco.studio.dear_imgui import dear_imgui as gui
@@ -293,7 +285,7 @@ def drive(u):
                     break  # the last page is closed; one that reloads is back sooner
                 mode, z, closed = hand.mode, hand.z, hand.closed
                 if asked != (mode, z, closed):
-                    asked, left, ahead = (mode, z, closed), u.planned_dense, []
+                    asked, left, ahead = (mode, z, closed), u.planned, []
                 if not ahead:  # a skill begins
                     if mode == "start again":
                         robots.reset([0])
@@ -340,26 +332,23 @@ def words(text, name, allowed):
 def settings(method, maze, config, given):
     """The constants of a method in a maze: those of the file and EXPERIMENTS (config), over them MAZE's row,
     over it METHODS' row, over all the flags (given). Exits with 2 and one line if they make no sense."""
-    rows, of = MAZE[maze] | METHODS[method], f"of {method} in {maze}"
+    rows, of = MAZE[maze] | METHODS[method], f"{method} in {maze}"
     walls = rows.pop("WALLS", [])
     for name, value in rows.items():
         if name not in config or name in OF_A_RUN:
-            stop(f"{name} {of} is no constant that a row may set")
-        rows[name] = common.convert(value, config[name], f"{name} {of}")
+            stop(f"{of}: {name} is no constant that a row may set")
+        rows[name] = common.convert(value, config[name], f"{of}: {name}")
     values = {name.lower(): value for name, value in (config | rows | given).items() if name not in OF_A_RUN}
     u = SimpleNamespace(**values | dict(method=method, maze=maze, walls=walls))
     u.modes = words(u.modes, "modes", ["printed", "closed"])
     u.rewards = words(u.rewards, "rewards", ["dense", "sparse"])
-    for name in ("samples", "look_ahead", "policy_seeds"):
-        numbers = [common.convert(word, 1, f"{name} {of}") for word in values[name].split() or ["0"]]
-        setattr(u, name, numbers)
-    for name in ("samples", "trials", "hold", "length", "planned_dense", "planned_sparse", "pool"):
-        if np.min(getattr(u, name)) < 1:
-            stop(f"{name} {of} is {values[name]}, but must be at least 1")
+    u.samples = [common.convert(word, 1, "--samples") for word in u.samples.split() or ["0"]]
+    u.look_ahead = [common.convert(word, 1, "--look_ahead") for word in u.look_ahead.split()] or [0]
+    u.policy_seeds = [common.convert(word, 0, "--policy_seeds") for word in u.policy_seeds.split()]
     if u.episode < u.hold * u.length:
-        stop(f"an episode {of} has {u.episode} steps, but one skill {u.hold * u.length}")
+        stop(f"{of}: an episode has {u.episode} steps, but one skill {u.hold * u.length}")
     if not all(len(wall) == 4 and wall[0] < wall[1] and wall[2] < wall[3] for wall in walls):
-        stop(f"WALLS {of}: each is (x0, x1, y0, y1) in metres, with x0 < x1 and y0 < y1")
+        stop(f"{of}: WALLS: each is (x0, x1, y0, y1) in metres, with x0 < x1 and y0 < y1")
     return u
 
 
@@ -377,8 +366,8 @@ def units_of(config, given):
                 print(f"{title} is left out: no {name} of 03_train_policy.py --experiment {shared.policy}")
                 continue
             policy = load_once(OUT, shared.policy, seed)
-            if policy.robot != "ant" or mode == "closed" and isinstance(policy.decoder, common.SkillDynamics):
-                stop(f"{title}: mazes are for the ant, the closed loop for commands that are displacements")
+            if policy.robot != "ant" or policy.method == "dads" and (mode, shared.length) != ("printed", 1):
+                stop(f"{title}: mazes are for the ant; DADS has no closed loop, and a --length of 1")
             u = SimpleNamespace(**vars(shared) | dict(mode=mode, policy_seed=seed, title=title))
             del u.modes, u.policy_seeds  # what else is planned changes no result
             following = common.FEEDBACK, common.CORRECTION, common.FASTEST, common.SOFT_START
@@ -410,17 +399,14 @@ def resampled_means(values, rng, draws=10_000):
 
 def print_table(rows):
     """A line per maze, reward, method, N and look-ahead, the modes side by side."""
-    lines = {}
+    form, lines = "{maze:10} {reward:7} {method:10} N {samples:>5}, {look_ahead:>3} steps ahead", {}
     for row in rows:
-        key = tuple(row[name] for name in ("maze", "reward", "method", "samples", "look_ahead"))
-        lines.setdefault(key, {}).setdefault(row["mode"], []).append(row)
-    for (maze, reward, method, samples, ahead), modes in lines.items():
-        print(f"{maze:10} {reward:7} {method:10} N {samples:>5}, {ahead:>3} steps ahead", end="")
-        for mode, found in modes.items():
-            distance, success = (np.mean([float(row[name]) for row in found])
-                                 for name in ("final_distance", "success"))
-            print(f" | {mode} {distance:4.1f} m {100 * success:3.0f} %", end="")
-        print()
+        end = float(row["final_distance"]), float(row["success"])
+        lines.setdefault(form.format(**row), {}).setdefault(row["mode"], []).append(end)
+    for line, modes in lines.items():
+        means = [(mode, *np.mean(ends, 0)) for mode, ends in modes.items()]
+        cells = [f"{mode} {distance:4.1f} m {100 * success:3.0f} %" for mode, distance, success in means]
+        print(line, *cells, sep=" | ")
 
 
 def draw_maze(ax, u, title):

@@ -44,74 +44,58 @@ def stop(message, code=2):
     raise SystemExit(code)
 
 
-def convert(value, like, name):
-    """value (a flag's text, or an entry of a row) -> the type of `like`. Exits with 2 if it does not fit."""
-    text = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
-    if isinstance(like, str):
-        return text
-    if isinstance(like, bool):
-        if text.lower() not in ("true", "false"):
-            stop(f"{name} is {text!r}, but must be true or false")
-        return text.lower() == "true"
-    try:
-        numbers = [float(part) for part in text.split()]
-    except ValueError:
-        numbers = []
-    fits = len(numbers) == np.size(like) and all(map(math.isfinite, numbers))
-    if fits and isinstance(like, tuple):
-        return tuple(numbers)
-    if fits and (isinstance(like, float) or numbers[0].is_integer()):
-        return type(like)(numbers[0])
-    kinds = {int: "a whole number", float: "a number", tuple: f"{np.size(like)} numbers"}
-    stop(f"{name} is {text!r}, but must be {kinds[type(like)]}")
+def convert(value, like, name, least=0):
+    """value (a flag's text, or what a file says) -> the type of `like`. Exits with 2 if it does not fit.
+    Whole numbers are at least 1 (0 where the file says 0, and for seeds); others at least `least`."""
+    kind, text = type(like), str(value).lower()
+    if kind is str:
+        return str(value)
+    if kind is bool and text in ("true", "false"):
+        return text == "true"
+    if kind is tuple:
+        parts = value if isinstance(value, tuple) else text.split()
+        if len(parts) == len(like):
+            return tuple(convert(part, one, name, -1e9) for part, one in zip(parts, like))
+    if kind is int and like > 0 and least == 0 and not name.lower().endswith("seed"):
+        least = 1
+    with contextlib.suppress(ValueError):
+        number = float(text)
+        if kind in (int, float) and least <= number < math.inf and number == kind(number):
+            return kind(number)
+    kinds = {bool: "true or false", int: f"a whole number of at least {least}",
+             float: f"a number of at least {least:g}", tuple: f"{np.size(like)} numbers"}
+    stop(f"{name} is {value!r}, but must be {kinds[kind]}")
 
 
 def parse_flags(stage, argv=None):
     """Make each `NAME = value # comment` at the top of a stage (its globals()) a flag --name, and set it. A
-    row of EXPERIMENTS overrides constants, a flag both. Returns {NAME: value}, and the same of the flags
-    alone. Exits with 2 if a flag, a row, a type or OUT is wrong."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    row of EXPERIMENTS overrides it, a flag both. Returns {NAME: value}, and the flags' alone."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop("stopped; --resume true goes on from the last checkpoint", 1))
     if hasattr(signal, "SIGPIPE"):
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # piped into head: end as other programs do
-    sys.excepthook = one_line_when_stopped
     parser = argparse.ArgumentParser(description=stage["__doc__"], allow_abbrev=False,
+                                     argument_default=argparse.SUPPRESS,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.error = lambda message: stop(f"{message}; see --help")
-    names, source = [], Path(stage["__file__"]).read_text(encoding="utf-8")
+    values, source = {}, Path(stage["__file__"]).read_text(encoding="utf-8")
     for name, text, comment in re.findall(r"^([A-Z_]+) = (.*?)(?:  +# (.*))?$", source, re.MULTILINE):
-        if not isinstance(stage[name], (bool, int, float, str, tuple)):
-            continue
-        if isinstance(stage[name], float) and stage[name].is_integer() and "." not in text:
-            stage[name] = int(stage[name])  # 1e4 means ten thousand
-        names.append(name)
-        parser.add_argument("--" + name.lower(), dest=name, metavar=type(stage[name]).__name__,
-                            help=f"{comment} [{stage[name]}]".replace("%", "%%"))
-    parsed, unknown = parser.parse_known_args(argv)
-    if unknown:
-        stop(f"unknown flag {unknown[0]}; allowed: {' '.join('--' + name.lower() for name in names)}")
-    given = {name: convert(value, stage[name], "--" + name.lower())
-             for name, value in vars(parsed).items() if value is not None}
+        if isinstance(stage[name], (bool, int, float, str, tuple)):
+            values[name] = int(stage[name]) if re.fullmatch(r"\d+e\d+", text) else stage[name]  # 1e4
+            parser.add_argument("--" + name.lower(), dest=name, metavar=type(values[name]).__name__,
+                                help=f"{comment} [{values[name]}]".replace("%", "%%"))
+    given = vars(parser.parse_args(argv))
     experiment, rows = given.get("EXPERIMENT", stage["EXPERIMENT"]), stage["EXPERIMENTS"]
     if experiment not in rows:
         stop(f"unknown experiment {experiment!r}; allowed: {' '.join(rows)}")
-    for name, value in rows[experiment].items():
-        where = f"{name} in the row {experiment!r} of EXPERIMENTS"
+    for name in rows[experiment]:
         if name not in stage:
-            stop(f"{where} is no constant of this file")
-        stage[name] = convert(value, stage[name], where) if name in names else value
-    stage.update(given)
-    signed = [name for row in rows.values() for name, v in row.items() if type(v) in (int, float) and v < 0]
-    for name in names:
-        if name not in signed and isinstance(stage[name], (int, float)) and stage[name] < 0:
-            stop(f"--{name.lower()} must be 0 or more")
+            stop(f"{name} in the row {experiment!r} of EXPERIMENTS is no constant of this file")
+    stage.update(rows[experiment] | given)
+    config = {name: convert(stage[name], like, "--" + name.lower()) for name, like in values.items()}
+    stage.update(config)
     write_whole(Path(stage["OUT"]) / f".can_write_{os.getpid()}", b"").unlink()  # before any work is lost
-    return {name: stage[name] for name in names}, given
-
-
-def one_line_when_stopped(kind, error, trace):
-    if kind is not KeyboardInterrupt:
-        return sys.__excepthook__(kind, error, trace)
-    print("\nstopped; what was saved stays; --resume true goes on from the last checkpoint", file=sys.stderr)
+    return config, {name: config[name] for name in given}
 
 
 # ---------------------------------------------------------------- artifacts and CSV
@@ -138,8 +122,7 @@ def artifact_name(kind, experiment, seed):
 
 
 def save(out, kind, experiment, seed, config, **content):
-    """Write <out>/<kind>_<experiment>_seed<seed>; content: arrays (.npz), or tensors and plain values (.pt).
-    The last 32 bytes are the SHA-256 of all bytes before them."""
+    """Write an artifact: arrays, or tensors and plain values, then the 32 bytes of their SHA-256."""
     meta = dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed, config=config,
                 versions=dict(torch=str(torch.__version__), mujoco=mujoco.__version__, numpy=np.__version__))
     buffer = io.BytesIO()
@@ -228,12 +211,10 @@ def weak_labels(factors, names, ranges):
         if name in MULTI:
             label = np.select([factors[name] > 0, factors[name] < 0], [1, 2], 0)
         else:
-            low, high = ranges[name]
-            share = (factors[name] - low) / (high - low)
-            if name == "direction":  # from the left downwards
-                share = 1 - share
-            label = np.clip(np.floor(CLASSES[name] * share), 0, CLASSES[name] - 1)
-        labels.append(label.astype(np.int64))
+            label = np.digitize(factors[name], np.linspace(*ranges[name], CLASSES[name] + 1)[1:-1])
+        if name == "direction":  # from the left downwards
+            label = CLASSES[name] - 1 - label
+        labels.append(label)
     return np.stack(labels, 1)
 
 
@@ -297,54 +278,24 @@ class Decoder(nn.Module):
         self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2 * x_dim))
         self.register_buffer("axes", torch.eye(z_dim))  # canonical z -> latents: a signed permutation
 
-    def unroll(self, latents, steps):
-        """Latents of training (B, M) -> mean and log-variance of displacements, (B, steps, x_dim) each."""
-        read = latents
-        i = self.circle
+    def forward(self, z, steps):
+        """z (B, M) -> mean and log-variance of displacements, (B, steps, x_dim) each. In training z are the
+        latents; after 02 axis m is factor m, and + is more of it."""
+        z, i = z @ self.axes, self.circle
         if i is not None:
-            read = torch.cat([latents[:, :i], on_circle(latents[:, i]), latents[:, i + 1:]], 1)
-        mean = latents.new_zeros(len(latents), self.x_dim)
-        state, means, log_vars = None, [], []
+            z = torch.cat([z[:, :i], on_circle(z[:, i]), z[:, i + 1:]], 1)
+        mean, state, means, log_vars = z.new_zeros(len(z), self.x_dim), None, [], []
         for _ in range(steps):
-            state = self.cell(torch.cat([mean, read], 1), state)
+            state = self.cell(torch.cat([mean, z], 1), state)
             mean, log_var = self.head(state[0]).chunk(2, 1)
             means.append(mean)
             log_vars.append(log_var)
         return torch.stack(means, 1), torch.stack(log_vars, 1)
 
-    def forward(self, z, steps):
-        """Canonical z (B, M): axis m is factor m, + is more of it -> as unroll."""
-        return self.unroll(z @ self.axes, steps)
-
 
 def on_circle(z):
     """Angle latents (B,), of which 3 is a whole turn -> cosine and sine (B, 2)."""
     return torch.stack([(z * 2 * math.pi / 3).cos(), (z * 2 * math.pi / 3).sin()], 1)
-
-
-class SkillDynamics(nn.Module):
-    """q_phi(displacement | z) of DADS: a mixture of Gaussians with unit covariance on normalised
-    displacements. It reads z alone: without the place, nothing of the state is left for it."""
-
-    def __init__(self, z_dim=2, x_dim=2, hidden=512, components=4):
-        super().__init__()
-        self.arguments = (z_dim, x_dim, hidden, components)
-        self.x_dim = x_dim
-        self.net = layers(z_dim, hidden, components * (1 + x_dim))
-        self.register_buffer("x_mean", torch.zeros(x_dim))
-        self.register_buffer("x_std", torch.ones(x_dim))
-
-    def mixture(self, z):
-        """z (B, m) -> log weights (B, K) and means (B, K, x_dim), normalised."""
-        logit, mean = self.net(z).view(len(z), -1, 1 + len(self.x_mean)).split([1, len(self.x_mean)], 2)
-        return logit.squeeze(2).log_softmax(1), mean
-
-    def forward(self, z, steps):
-        """As Decoder: the mean displacement, at each step the same, (B, steps, x_dim), and no
-        log-variance."""
-        log_weight, mean = self.mixture(z)
-        mean = self.x_mean + self.x_std * (log_weight.exp()[..., None] * mean).sum(1)
-        return mean[:, None].expand(-1, steps, -1), None
 
 
 def pack(module):
@@ -353,16 +304,14 @@ def pack(module):
 
 
 def unpack(packed):
-    kinds = dict(Decoder=Decoder, SkillDynamics=SkillDynamics, Actor=Actor)
-    module = kinds[packed["network"]](*packed["arguments"])
+    module = dict(Decoder=Decoder, Actor=Actor)[packed["network"]](*packed["arguments"])
     module.load_state_dict(packed["state"])
     return module.requires_grad_(False)
 
 
 def next_skill(z, names, relation):
-    """The relation functions f, Sec. 4.2.2, 6.1.2, A.3.2: z (..., M) of one transition -> of the next. names:
-    of the axes; relation: {factor of z_multi: weight} (the paper, by hand: -0.2, 0.1; 03: from the
-    decoder)."""
+    """The relation functions f, Sec. 4.2.2, 6.1.2, A.3.2: z (..., M) of one transition -> of the next. names
+    of the axes; relation {factor of z_multi: weight} (the paper, by hand: -0.2, 0.1)."""
     z = z.clone()
     for factor, weight in relation.items():
         change = weight * z[..., names.index(factor)]
@@ -384,7 +333,7 @@ def first_step(decoder, z_single):
 def commands_of(policy, z, steps):
     """The commands of skills z (B, M): (B, `steps`, c_dim) in trajectory units. WEDIS: first steps of the
     decoder, with relation functions in between; SeCTAR: its decoder's steps; DADS: z itself."""
-    if isinstance(policy.decoder, SkillDynamics):
+    if policy.method == "dads":
         return z[:, None].expand(-1, steps, -1)
     if not policy.names:
         return policy.decoder(z, steps)[0]
@@ -414,20 +363,15 @@ class Robots:
         model = spec.compile()
         self.batch = Batch(model, n, threads)
         self.places = 2 if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE else 1
-        self.rest = model.key_qpos[0].copy()
-        views = map(self.batch.bind, ("qpos", "qvel", "ctrl", "time"))  # of MuJoCo's own arrays
-        self.qpos, self.qvel, self.ctrl, self.time = views
+        self.qpos, self.qvel, self.ctrl, self.time = map(self.batch.bind, ("qpos", "qvel", "ctrl", "time"))
         self.reset(np.arange(n))
 
-    def reset(self, ids, rng=None, noise=0.1):
-        """Robots ids at the origin at rest; with rng, U(-noise, noise) is added to qpos, N(0, noise) to
-        qvel."""
-        self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)  # also clears the solver's warm start
-        self.qpos[ids] = self.rest
-        self.time[ids] = 1.0  # clocks start at 1 s, MuJoCo's own reset of an unstable simulation at 0
+    def reset(self, ids, rng=None):
+        """Robots ids at the origin at rest; with rng, plus U(-0.1, 0.1) on qpos and N(0, 0.1) on qvel."""
+        self.batch.reset(ids, keyframe=0, stage=mujoco.mjtStage.mjSTAGE_NONE)  # warm start and warnings too
         if rng is not None:
-            self.qpos[ids] += rng.uniform(-noise, noise, (len(ids), self.qpos.shape[1]))
-            self.qvel[ids] = rng.normal(0, noise, (len(ids), self.qvel.shape[1]))
+            self.qpos[ids] += rng.uniform(-0.1, 0.1, (len(ids), self.qpos.shape[1]))
+            self.qvel[ids] = rng.normal(0, 0.1, (len(ids), self.qvel.shape[1]))
 
     def place(self):
         """Places (n, 2 or 1) in metres. Float32."""
@@ -435,7 +379,7 @@ class Robots:
 
     def age(self):
         """Environment steps since the last reset (n, 1). Float32."""
-        return torch.from_numpy((self.time.reshape(-1, 1) - 1.0).astype(np.float32)) / 0.05
+        return torch.from_numpy(self.time[:, None].astype(np.float32)) / 0.05
 
     def observe(self):
         """The policy's state, App. A.1.3: qpos without the place, qvel. (n, 27), Half-Cheetah (n, 17)."""
@@ -449,12 +393,11 @@ class Robots:
 
     def step(self, action):
         """One environment step of 0.05 s. action (n, nu) in [-1, 1]. Returns displacement (n, 2 or 1) in
-        metres and which robots are unstable (n,): MuJoCo resets those, and their displacement means
-        nothing."""
-        before, clock = self.qpos[:, :self.places].copy(), self.time.copy()
+        metres, and which robots were unstable since their reset (n,): their displacement means nothing."""
+        before = self.qpos[:, :self.places].copy()
         self.ctrl[:] = action
         self.batch.step(nstep=FRAME_SKIP)
-        unstable = (self.time <= clock).reshape(-1) | ~np.isfinite(self.qpos).all(1)
+        unstable = self.batch.warning.any((1, 2))
         return torch.from_numpy((self.qpos[:, :self.places] - before).astype(np.float32)), unstable
 
 
@@ -514,13 +457,12 @@ class Actor(nn.Module):
 
 FEEDBACK = 0.1     # closed loop: share of the distance to the reference that each command adds (the paper: 0)
 CORRECTION = 0.2   # at most so much, trajectory units
-FASTEST = 0.9      # no command is longer, trajectory units: much longer ones than in training make falls
+FASTEST = 1.0      # no command is longer, trajectory units: much longer ones than in training make falls
 SOFT_START = 20    # environment steps over which the longest command grows from 0.2 to FASTEST
 
 
 def closed_loop(c, reference, robots, scale):
-    """Commands of robots that should be at reference (n, 2 or 1), metres, and go on by c (n, 2 or 1),
-    units."""
+    """Commands (n, 2 or 1) of robots that should be at reference, metres, and go on by c, units."""
     correction = FEEDBACK * (reference - robots.place()) / scale
     c = c + correction * (CORRECTION / correction.norm(dim=1, keepdim=True).clamp(min=CORRECTION))
     longest = (0.2 + (FASTEST - 0.2) * robots.age() / SOFT_START).clamp(max=FASTEST)
@@ -529,7 +471,7 @@ def closed_loop(c, reference, robots, scale):
 
 def execute(policy, robots, commands, hold, closed, deterministic):
     """Alg. 2, lines 13-19: hold each of the commands (n, T, c_dim), trajectory units, for `hold` (H_z) steps.
-    Yields what Robots.step returns after each (for contacts, frames and stopping)."""
+    Yields what Robots.step returns after each (for frames and stopping)."""
     reference = robots.place()
     for c in commands.unbind(1):
         for _ in range(hold):
@@ -549,10 +491,7 @@ def load_policy(out, experiment, seed):
 
 # ---------------------------------------------------------------- plots
 
-# The paper's red, green, blue, cyan, yellow for latents (-1, -0.5, 0, 0.5, 1), in colour-blind safe hues.
-LATENT_COLOURS = dict(zip((-1, -0.5, 0, 0.5, 1), ("#D55E00", "#009E73", "#0072B2", "#56B4E9", "#F0E442")))
 BLUE, RED, GREY = "#0072B2", "#D55E00", "#888888"
-TRAVERSAL_MAP = "viridis"  # for many values of one latent
 plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
                      "grid.alpha": 0.25, "figure.dpi": 110, "savefig.bbox": "tight", "legend.frameon": False,
                      "axes.titlesize": 10, "figure.constrained_layout.use": True})

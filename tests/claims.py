@@ -61,7 +61,8 @@ def counts(found):
 def table2(units):
     """Table 2, as rows, from the settings that the planner uses."""
     return [dict(method=u.method, episode_steps=u.episode, hold=u.hold, length=u.length,
-                 steps_per_skill=u.hold * u.length, skills_dense=u.planned_dense, skills_sparse=u.planned_sparse,
+                 steps_per_skill=u.hold * u.length, skills_dense=u.planned,
+                 skills_sparse=u.episode // (u.hold * u.length),  # to the end of the episode
                  z_range=u.z_range, slowest_speed=0.0 if "wedis" in u.method else -u.z_range)
             for u in {u.method: u for u in units}.values()]
 

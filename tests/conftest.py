@@ -33,6 +33,15 @@ for number, name in (("s1", S1), ("s2", S2), ("s3", S3), ("s4", S4)):
     globals()[number] = pytest.fixture(lambda name=name: script(name), name=number)
 
 
+@pytest.fixture(autouse=True)
+def handlers():
+    """Signals do what they did before: each stage's parse_flags sets them for its own process."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGPIPE)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 # ---------------------------------------------------------------- a tiny policy training
 
 TINY = dict(updates=24, robots=8, skill_steps=5, episode=20, warm_up=80, replay=800, batch=16, hidden=16, reports=2,
@@ -60,9 +69,6 @@ def out(tmp_path):
 @pytest.fixture
 def inside(monkeypatch, capsys):
     """inside(stage, *flags) runs a stage's main in this process, without pictures: exit code, stdout, stderr."""
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGPIPE)}
-    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
-
     def run(stage, *flags):
         monkeypatch.setattr(sys, "argv", [stage.__file__, *map(str, flags)])
         if hasattr(stage, "draw_robots"):
@@ -77,9 +83,7 @@ def inside(monkeypatch, capsys):
             vars(stage).update(constants)  # the next run begins as from a fresh file
         printed = capsys.readouterr()
         return SimpleNamespace(returncode=code, stdout=printed.out, stderr=printed.err)
-    yield run
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
+    return run
 
 
 def one_line(done, *codes):
@@ -104,7 +108,6 @@ for line in sys.stdin:
         child, code = os.fork(), None
         if not child:
             signal.alarm(600)  # nothing may hang
-            signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores Ctrl-C
             for number, path in enumerate(streams, 1):
                 os.dup2(os.open(path, os.O_WRONLY), number)
             sys.stdout.reconfigure(line_buffering=True)

@@ -259,10 +259,10 @@ def baselines():
     rows = []
     for row in policy_rows(POLICIES[4:]):
         rows.append([f"`{row['experiment']}`", row["seed"], number(row["train_minutes"], ".0f"), row["updates"],
-                     number(row["tracking_error"]), number(row["metric"])])
+                     number(row["tracking_error"])])
     if not rows:
         return missing("The baselines are", "python 03_train_policy.py --experiment ant_dads")
-    return markdown(["policy", "seed", "minutes", "updates", "tracking error, open", "own measure"], rows) + absent(POLICIES[4:])
+    return markdown(["policy", "seed", "minutes", "updates", "tracking error, open"], rows) + absent(POLICIES[4:])
 
 
 def fig7():
@@ -474,13 +474,13 @@ def full_policies():
                       number(row["tracking_error"], ".3f"), number(row["tracking_error_closed"], ".3f"),
                       *(number(row[f"{key}{end}"], form, scale) for key, form, scale in (
                           ("follow_median_m", ".2f", 1), ("follow_p90_m", ".2f", 1), ("fall_rate", ".2f", 100))
-                        for end in ("_open", "")), number(row.get("metric"))])
+                        for end in ("_open", ""))])
         if row["method"] == "wedis":
             second.append([*name, *(f"{number(row.get(f'purity_{axis}_open'))}, {number(row.get(f'purity_{axis}'))}"
                                     for axis in common.SINGLE + common.MULTI)])
     return markdown(["policy", "seed", "updates", "environment steps", "minutes", "tracking error, open", "closed",
-                     "following error, median m, open", "closed", "90 % m, open", "closed", "falls %, open", "closed",
-                     "own measure"], first) + [
+                     "following error, median m, open", "closed", "90 % m, open", "closed", "falls %, open", "closed"],
+                    first) + [
         "", "Executed purity, open loop and closed loop (- : not an axis, or unused):", ""] + markdown(
         ["policy", "seed", "speed", "direction", "curvature", "acceleration"], second) + absent(POLICIES)
 
@@ -495,11 +495,10 @@ def full_planning(name, what, command):
         low, high = interval(distance)
         rows.append([NAMES.get(maze, maze), kind, NAMES.get(method, method), NAMES[mode], str(ahead), str(samples),
                      f"{distance.mean():.2f}", f"{low:.2f} .. {high:.2f}", f"{np.median(distance):.2f}",
-                     f"{100 * success.mean():.0f} %", number(by_policy(found, "contacts").mean(), ".1f"),
-                     number(by_policy(found, "planning_ms").mean(), ".1f"), f"{len(distance)} x {distance.shape[1]}"])
+                     f"{100 * success.mean():.0f} %", number(by_policy(found, "planning_ms").mean(), ".1f"),
+                     f"{len(distance)} x {distance.shape[1]}"])
     return markdown(["maze", "reward", "method", "mode", "look-ahead, steps", "samples", "mean distance, m",
-                     "95 % interval", "median", "success", "steps with wall contact", "ms a plan", "policies x trials"],
-                    rows) if rows else missing(what, command)
+                     "95 % interval", "median", "success", "ms a plan", "policies x trials"], rows) if rows else missing(what, command)
 
 
 def per_policy():
@@ -546,8 +545,8 @@ SECTIONS = [
     ("Cross-talk: crosstalk.csv", "", full_crosstalk),
     ("Policies (03): policies.csv", "Tracking error: RMS(executed end - predicted end) / RMS(predicted end) over a grid of skills, "
      "100 steps from rest (SeCTAR: 25 draws, 50 steps). Following error: |executed - predicted end| of random skills of 200 steps "
-     "(Half-Cheetah: 120) from 400 noisy starts, three in a row. Falls: robots that turn over in that time. Own measure: DADS mutual "
-     "information in nats, SeCTAR reconstruction error. Baselines have no closed loop.", full_policies),
+     "(Half-Cheetah: 120) from 400 noisy starts, three in a row. Falls: robots that turn over in that time. Baselines have no "
+     "closed loop.", full_policies),
     ("Mazes (04): mazes.csv", "Intervals of all planning tables: 95 % bootstrap over policies and trials of each; with one "
      "policy they say nothing about the next one.",
      lambda: full_planning("mazes", "The mazes are", "python 04_mpc_maze.py")),

@@ -61,16 +61,20 @@ def test_flags_override_rows_and_rows_override_constants(flags):
 
 
 @pytest.mark.parametrize("argv, message", [
-    ("--nonsense 1", "unknown flag --nonsense; allowed: --experiment --seed --out --n"),
-    ("surplus", "unknown flag surplus"),
-    ("--shar 1", "unknown flag --shar"), ("--n many", "--n is 'many', but must be a whole number"),
+    ("--nonsense 1", "unrecognized arguments: --nonsense 1; see --help"),
+    ("surplus", "unrecognized arguments: surplus; see --help"),
+    ("--shar 1", "unrecognized arguments: --shar 1; see --help"), ("--n many", "--n is 'many', but must be a whole number"),
     ("--n 2.5", "--n is '2.5', but must be a whole number"),
-    ("--n -1", "--n must be 0 or more"), ("--share nan", "--share is 'nan'"),
+    ("--n -1", "--n is '-1', but must be a whole number of at least 1"), ("--n 0", "--n is '0', but must be a whole number of"),
+    ("--seed -1", "--seed is '-1', but must be a whole number of at least 0"),
+    ("--share -0.5", "--share is '-0.5', but must be a number of at least 0"), ("--share nan", "--share is 'nan'"),
     ("--share inf", "--share is 'inf'"), ("--flag maybe", "--flag is 'maybe', but must be true or false"),
-    ("--start 1", "--start is '1', but must be 2 numbers"), ("--n", "--n: expected one argument; see --help"),
+    ("--start 1", "--start is '1', but must be 2 numbers"), ("--start a b", "--start is 'a', but must be a number"),
+    ("--n", "--n: expected one argument; see --help"),
     ("--experiment nope", "unknown experiment 'nope'; allowed: plain other typo bad minus"),
-    ("--experiment typo", "SHRE in the row 'typo' of EXPERIMENTS is no constant"), ("--experiment bad", "N in the row 'bad'"),
-    ("--experiment minus", "--n must be 0 or more")])
+    ("--experiment typo", "SHRE in the row 'typo' of EXPERIMENTS is no constant"),
+    ("--experiment bad", "--n is 2.5, but must be a whole number"),
+    ("--experiment minus", "--n is '-1', but must be a whole number of at least 1")])
 def test_what_is_wrong_on_the_command_line_is_one_line(flags, argv, message):
     error = flags(*argv.split(maxsplit=1))
     assert message in error and len(error.splitlines()) == 1
