@@ -69,7 +69,7 @@ FREE = {"OUT", "TRAIN", "RESUME", "THREADS", "FIGURE"}  # change no model
 class Encoder(nn.Module):
     """q_phi(z | tau, y), Fig 1 (the state decoder is common.Decoder): an LSTM over displacements and labels.
 
-    circle: index of a latent that is an angle, 3 of which are a whole turn. Its mean is the direction of two
+    circle: index of a latent that is an angle, a turn from -1.5 to 1.5. Its mean is the direction of two
     outputs: a single output would have to jump from one end to the other where the circle closes."""
 
     def __init__(self, x_dim, y_dim, z_dim, hidden, circle=None):
@@ -93,11 +93,9 @@ class Encoder(nn.Module):
 
 
 class LabelDecoders(nn.Module):
-    """p_theta(y^m | z), the M label decoders of Eq. 4, each an MLP that reads all of z.
-
-    own_axis: label m is read from latent m alone, and its classes lie in order along it. Without the order
-    they settle in any: straight at one end, left and right side by side. On a circle they lie at their true
-    angles, which fixes where direction 0 is."""
+    """p_theta(y^m | z), the M label decoders of Eq. 4: MLPs over all of z (the paper) or, with own_axis, the
+    logits scale * z^m * order_k + bias_k of classes k. Without a fixed order, straight may lie at one end and
+    left beside right. On a circle, classes lie at their true angles: this fixes direction 0."""
 
     def __init__(self, labels, z_dim, hidden, circle, own_axis):
         super().__init__()
@@ -111,7 +109,7 @@ class LabelDecoders(nn.Module):
                 nn.Sequential(nn.Linear(z_dim, hidden), nn.ReLU(), nn.Linear(hidden, size)) for size in sizes)
         for m, name in enumerate(labels):
             self.order.append(torch.arange(0.0, sizes[m])[None])
-            if name in common.MULTI:  # none lies between positive and negative
+            if name in common.MULTI:  # class 0, zero, lies between positive and negative
                 self.order[m] = torch.tensor([[0.0, 1.0, -1.0]])
             if m == circle:  # the middle of each class, from the left downwards
                 self.order[m] = on_circle(1.5 - 3 / sizes[m] * (self.order[m][0] + 0.5)).T
@@ -128,7 +126,7 @@ class LabelDecoders(nn.Module):
 
 def divergence(mean, log_var, circle):
     """D_KL(q(z | tau, y) || p(z)) of each latent (B, z_dim). p is N(0, 1); of an angle it is uniform over the
-    turn, and the noise counts as if it did not wrap, which is 0.1 too little at most."""
+    turn; noise is treated as if it did not wrap, which is at most 0.1 too little."""
     kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var)
     if circle is not None:
         entropy = 0.5 * (math.log(2 * math.pi * math.e) + log_var[:, circle])
@@ -141,7 +139,8 @@ def objective(encoder, decoder, label_decoders, x, one_hot, y):
     x (B, T, x_dim) displacements; the labels as one_hot (B, y_dim), side by side, and as classes y (B, M)."""
     mean, log_var = encoder(x, one_hot)
     z = mean + torch.randn_like(mean) * (0.5 * log_var).exp()  # z ~ q(z | tau, y)
-    step, step_log_var = decoder(z, x.shape[1])  # below: sum_t log p(s_t | s_1:t-1, z)
+    step, step_log_var = decoder(z, x.shape[1])
+    # sum_t log p(s_t | s_1:t-1, z); in the place of s_1:t-1 the decoder reads its own means
     states = -F.gaussian_nll_loss(step, x, step_log_var.exp(), full=True, reduction="sum") / len(x)
     logits = label_decoders(z)
     labels = -sum(F.cross_entropy(logits[m], y[:, m]) for m in range(len(logits)))  # sum_m log p(y^m | z)

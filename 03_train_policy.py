@@ -27,7 +27,7 @@ SEED = 0                 # random seed
 OUT = "runs"             # folder that everything is written to
 TRAIN = True             # false: only measure and draw what is already trained
 RESUME = False           # true: continue from the last checkpoint
-THREADS = 2              # CPU threads; 1: the robots wait for the updates, with the same result
+THREADS = 2              # CPU threads; 1: updates begin after the robots' step, with the same result
 REPORTS = 20             # printed lines, points of the learning curve, and checkpoints
 
 METHOD = "wedis"         # wedis, dads or sectar
@@ -52,14 +52,16 @@ CORRECTED = 0.25         # share of skills with a random correction, as the clos
 HIDDEN = 256             # width of the two hidden layers (the paper: 512)
 LEARNING_RATE = 1e-3     # Adam (the paper: 3e-4, fixed)
 DECAY_FROM = 0.5         # share of the updates after which the learning rate falls linearly to 0
-ACTOR_EVERY = 2          # actor and value network learn in each second update of the critics (the paper: 1)
-AVERAGED = 0.002         # rate of the running average of the actor's weights: the policy (the paper: 1)
+ACTOR_EVERY = 2          # actor and value network learn once in so many updates of the critics (the paper: 1)
+AVERAGED = 0.002         # rate of the running average of the actor's weights, which is the policy (1: actor)
 DISCOUNT = 0.98          # gamma of Eq. 1 (the paper: 0.99): a shorter horizon teaches to follow sooner
 SMOOTHING = 0.01         # of the target value network, App. A.1.3
 REWARD_SCALE = 0.1       # of Eq. 6 (the paper: 1)
 TEMPERATURE = 0.003      # alpha, weight of the entropy (the paper: 0.01, which is 0.001 at our reward scale)
-FLOOR_START = 0.04       # metres, least deviation of the reward: a sharp one makes standing still a trap
-FLOOR_END = 0.01         # shrinks to this between 0.15 and 0.6 of the updates: teaches the slow skills
+FLOOR_START = 0.04       # metres, least deviation in the reward; if small at first, robots stand still
+FLOOR_END = 0.01         # its value from 0.6 of the updates on (it shrinks from 0.15): teaches slow skills
+
+Z_RANGE = 1.5            # ends of a traversed axis, and of the skills that fit the relation weights
 
 # Baselines only
 Z_DIM = 2                # entries of z: DADS 2, SeCTAR 8
@@ -71,7 +73,6 @@ KL_WEIGHT = 2.0          # SeCTAR: of the KL divergence in its ELBO
 
 # Measuring only: never an obstacle to --resume
 DIRECTIONS = 5           # of the tracking grid, from -Z_RANGE to Z_RANGE of z_dir
-Z_RANGE = 1.5            # ends of a traversed axis
 SINGLE_RUN = (1, 100)    # T and H_z of the tracking error, and of Fig 5 for axes of z_single, Sec. 6.1.2
 MULTI_RUN = (5, 40)      # T and H_z of the following error and of purity, and of Fig 5 for axes of z_multi
 TRAVERSAL = 13           # skills on each axis at which purity is measured
@@ -92,8 +93,8 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
     "ant_sectar": SECTAR | dict(FIGURE="fig05_skills_sectar"),
     "ant_sectar_no_explorer": SECTAR | dict(EXPLORE=0.0),  # what the explorer is good for
 }
-MAY_DIFFER = ("OUT TRAIN RESUME THREADS REPORTS UPDATES DIRECTIONS Z_RANGE SINGLE_RUN MULTI_RUN "
-              "TRAVERSAL NOISY STARTS FIGURE").split()  # from a checkpoint's
+MAY_DIFFER = ("OUT TRAIN RESUME THREADS REPORTS UPDATES DIRECTIONS SINGLE_RUN MULTI_RUN TRAVERSAL NOISY "
+              "STARTS FIGURE").split()  # from a checkpoint's
 
 
 # ---------------------------------------------------------------- SAC (Haarnoja et al. 2017), App. A.1.3
@@ -121,7 +122,7 @@ class Critics(nn.Module):
 
 class Sac:
     """Actor psi, twin critics, value and target network, with a fixed temperature. average: the policy that
-    is kept, a running average of the actor's weights (single ones swing from report to report)."""
+    is kept, a running average of the actor's weights (the actor itself varies from report to report)."""
 
     def __init__(self, s_dim, c_dim, a_dim):
         self.actor = Actor(s_dim, c_dim, a_dim, HIDDEN, BASE_FRAME)
@@ -149,7 +150,7 @@ class Sac:
 
     def update(self, x, a, x2, r):
         """One update. x, x2 (B, n): Actor.inputs before and after the step; a (B, m); r (B,). No step is
-        terminal (a time limit is none). Returns a number that is not finite if a loss is not."""
+        terminal: the time limit is no end of the task. Returns a loss, to detect nan."""
         with torch.no_grad():
             q_target = r + DISCOUNT * self.target(x2).squeeze(1)
         q_loss = 0.5 * ((self.critics(x, a) - q_target) ** 2).mean(1).sum()
@@ -162,9 +163,9 @@ class Sac:
         a_new, log_prob = self.actor(x)
         a_leaf = a_new.detach().requires_grad_()
         q_new = self.critics(x, a_leaf).min(0).values
-        # the trap: a plain backward through q_new also fills the critics' gradients, and costs another pass
+        # the trap: a backward through q_new also fills the critics' gradients; so take dQ/da first
         slope, = torch.autograd.grad(q_new.sum(), a_leaf)
-        actor_loss = (TEMPERATURE * log_prob - (slope * a_new).sum(1)).mean()
+        actor_loss = (TEMPERATURE * log_prob - (slope * a_new).sum(1)).mean()  # gradient of alpha log pi - Q
         v_loss = 0.5 * ((self.value(x).squeeze(1) - (q_new - TEMPERATURE * log_prob).detach()) ** 2).mean()
         loss = actor_loss + v_loss  # they share no parameter
         self.actor_adam.zero_grad()
@@ -179,8 +180,8 @@ class Sac:
 # ---------------------------------------------------------------- reward
 
 def reward(mean, log_var, displacement, floor):
-    """Eq. 6 for one step, minus its value at the decoder's mean, which depends on z alone, (B,). mean,
-    log_var of the decoder and displacement in metres, (B, 2 or 1) each; floor in metres."""
+    """log p of Eq. 6 for one step, (B,), without its normaliser, which depends on the skill alone. mean,
+    log_var (B, 2 or 1): trajectory units; displacement, floor: metres. Eq. 6's entropy is in Sac.update."""
     variance = (VARIANCE_SCALE * log_var.exp()).clamp(min=floor ** 2)
     return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * mean) ** 2 / variance).sum(1)
 
@@ -192,13 +193,13 @@ def train_wedis(run, decoder):
     m1 = run.z.shape[1] - decoder.x_dim
 
     def draw(n):
-        """z_single from the prior and beside it a correction of the command, in a disc or 0: (n, m1 + 2)."""
+        """z_single ~ prior and, side by side, a correction of the command as the closed loop adds it."""
         length = CORRECTION * torch.rand(n, 1).sqrt() * (torch.rand(n, 1) < CORRECTED)
         correction = length * nn.functional.normalize(torch.randn(n, decoder.x_dim))
         return torch.cat([torch.randn(n, m1), correction], 1)
 
     def command_of(z):
-        """Mean and log-variance of the step that is asked for, (n, 2) each."""
+        """z of draw -> mean and log-variance of the commanded step, (n, 2 or 1) each."""
         mean, log_var = first_step(decoder, z[:, :m1])  # Alg. 1: z = (z_single, 0)
         return mean + z[:, m1:], log_var
 
@@ -375,12 +376,12 @@ def main():
     check_constants(decoder, names)
     torch.manual_seed(SEED)
     if TRAIN and METHOD == "wedis":
-        relation = calibrate_relation(decoder, names, source["length"])
+        relation = calibrate_relation(decoder, names, source["length"])  # Alg. 1, last; needs no policy
         z_dim = sum(name in SINGLE for name in names)
         run = Run(z_dim + decoder.x_dim, decoder.x_dim, decoder, names, config)
         train_wedis(run, decoder)
     elif TRAIN:
-        decoder, names, relation = Decoder(Z_DIM, 2, 64), [], {}
+        decoder, names, relation = Decoder(Z_DIM, 2, 64), [], {}  # no names mark a baseline everywhere
         model = dict(decoder=decoder)
         if METHOD == "sectar":
             model["encoder"] = layers(2 * SKILL_STEPS, 64, 2 * Z_DIM)
@@ -422,9 +423,9 @@ def check_constants(decoder, names):
 # ================================================================ Baselines: not needed to understand WEDIS
 
 def train_dads(run):
-    """Sharma et al. 2019: skills z ~ U(-1, 1)^2; a step is worth its mutual information with z under the
-    skill dynamics q(displacement | z), a Gaussian (theirs: four), which learn too. Old steps count: it is
-    computed with the q of now."""
+    """Sharma et al. 2019: skills z ~ U(-1, 1)^2. The reward is the mutual information of step and z under the
+    skill dynamics q(displacement | z), a Gaussian (theirs: a mixture of four), learnt at the same time.
+    Rewards of old steps use the present q."""
     q = run.decoder
 
     def log_q(displacement, z):
@@ -468,7 +469,7 @@ EXPLORER = 3.0  # last entry of the z of SeCTAR's explorer: far from N(0, I), an
 
 def train_sectar(run):
     """Co-Reyes et al. 2018: skills z ~ N(0, I); the VAE learns from the trajectories of an explorer, the same
-    policy asked for far too long steps in any direction. Reward of a skill: the likelihood of ending where
+    policy with commands of length 3 in any direction. Reward of a skill: the likelihood of ending where
     the decoder says; of the explorer: what the VAE cannot reconstruct."""
     encoder, decoder = run.model["encoder"], run.decoder
 
@@ -520,10 +521,10 @@ def train_sectar(run):
             with torch.no_grad():
                 decoded = torch.where(explorer[:, None, None], elbo(x)[2], decoder(z, SKILL_STEPS)[0])
                 # Laplace likelihood of the place where a trajectory ends, shared among its steps. The trap:
-                # judged by single steps, a skill is paid for not trembling, which is standing still
-                miss = x - decoded
-                away = (miss * nn.functional.normalize(miss.sum(1))[:, None]).sum(2)
-                r = REWARD_SCALE * torch.where(explorer[:, None], away, -away)
+                # the likelihood of single steps is highest for a robot that stands still
+                error = x - decoded
+                along = (error * nn.functional.normalize(error.sum(1))[:, None]).sum(2)
+                r = REWARD_SCALE * torch.where(explorer[:, None], along, -along)
                 c = steps_of(z, decoded)
                 c2 = torch.cat([c[:, 1:], c[:, -1:]], 1)
                 s, a, s2, r, c, c2 = (v.flatten(0, 1) for v in (s, a, s2, r, c, c2))
@@ -615,7 +616,7 @@ def following(policy, closed):
 
 
 def executed_cross_talk(policy, ranges, closed):
-    """Cross-talk C (axes, factors) of executed skills, the mean over noisy starts, per fifth of a skill."""
+    """Cross-talk C (axes, factors) of executed skills, from steps of a fifth of a skill, a mean of starts."""
     values, curves = np.linspace(-Z_RANGE, Z_RANGE, TRAVERSAL), []
     every = max(1, MULTI_RUN[0] * MULTI_RUN[1] // 5)
     for axis in range(len(policy.names)):
@@ -627,7 +628,8 @@ def executed_cross_talk(policy, ranges, closed):
 
 
 def measure(policy, ranges):
-    """Print and write one row of results/policies.csv. _open: open loop, as in the paper."""
+    """Print and write one row of results/policies.csv. tracking_error: open loop; other columns: closed
+    loop, with _open as in the paper."""
     row = dict(experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy.updates,
                env_steps=policy.env_steps, threads=policy.config["THREADS"],
                train_minutes=policy.seconds / 60,

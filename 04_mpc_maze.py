@@ -50,14 +50,14 @@ Z_RANGE = 1.5               # skills ~ U(-Z_RANGE, Z_RANGE), but speed ~ U(0, Z_
 # Planning, App. A.1.4
 SAMPLES = "1000"            # N, sequences of skills per plan; one or more numbers
 LOOK_AHEAD = ""             # steps to plan ahead, one or more numbers ("": Table 2's H_P)
-POOL = 65536                # skills are drawn from so many, decoded once (the paper does not say)
+POOL = 65536                # skills, decoded once, that plans draw from (the paper: no pool)
 PENALTY = 100.0             # w_p, for each transition of a plan that collides
-REWARD = 5.0                # w_r, sparse reward
+REWARD_WEIGHT = 5.0         # w_r, sparse reward
 EPSILON = 5.0               # epsilon, metres: acceptable error; a trial that ends nearer is a success
 RADIUS = 1.0                # metres by which the planner grows the walls: the reach of the Ant's legs
 GOAL = (24.0, 12.0)         # x and y, metres; the Ant starts at (0, 0), 26.8 m away, 36 m along the axes
 
-METHODS = {  # Table 2; a row wins over a maze's, or a maze would give a scale to WEDIS-NTS
+METHODS = {  # Table 2; a row overrides a maze's, so s_maze's HOLD never reaches WEDIS-NTS
     "wedis": {},
     "wedis_s": dict(MODES="printed", LENGTH=1, PLANNED=4),            # single steps
     "wedis_nts": dict(MODES="printed", HOLD=1, LENGTH=20, PLANNED=4),  # no trajectory scaling
@@ -88,6 +88,7 @@ MAZE = {  # walls, and the constants in which a maze differs; plan a row of your
 
 
 # ---------------------------------------------------------------- Algorithm 2, Sec. 5
+# Lines are counted from "for i"; a skill's commands (lines 17 and 18) are computed at once.
 # A unit u is one method in one maze, one mode and one policy: all constants in lower case, after rows and
 # flags. All its cases (reward, N, H_P) with all their trials run in one simulation.
 
@@ -99,8 +100,9 @@ def skill_pool(u):
     if u.policy.names:  # speed is the first axis; the paper: U(-1.5, 0), for its axis points the other way
         low[0] = 0
     z = low + (high - low) * torch.rand(u.pool, len(low))
-    predict = partial(commands_of, u.policy) if u.mode == "closed" else lambda *z_t: u.policy.decoder(*z_t)[0]
-    return z, torch.cat([predict(part, u.length) for part in z.split(8192)])
+    if u.mode == "closed":
+        return z, torch.cat([commands_of(u.policy, part, u.length) for part in z.split(8192)])
+    return z, torch.cat([u.policy.decoder(part, u.length)[0] for part in z.split(8192)])
 
 
 def scaled_path(state, delta, scale):
@@ -111,11 +113,11 @@ def scaled_path(state, delta, scale):
 
 def reward(path, u, kind):
     """Planning reward r_d or r_s, Sec. 6.2, of paths (N, K + 1, 2), metres -> (N,): the task reward of the
-    last state, as the paper measures it, less w_p for each transition that collides."""
+    last state (the paper does not say which) less w_p for each transition that collides."""
     distance = (path[:, -1] - torch.tensor(u.goal)).norm(dim=1)  # -r(s)
     penalty = u.penalty * collides(path, u.walls, u.radius).sum(1)
     if kind == "sparse":
-        return u.reward * (distance < u.epsilon) - penalty  # r_s
+        return u.reward_weight * (distance < u.epsilon) - penalty  # r_s
     return -distance - penalty  # r_d
 
 
@@ -155,7 +157,7 @@ def run(u):
     pool, closed, poses = skill_pool(u), u.mode == "closed", [robots.qpos.copy()]
     for i in range(skills):                                                 # line 1
         chosen = []
-        for t, s0 in zip(trials, robots.place()):
+        for t, s0 in zip(trials, robots.place()):                           # line 20, of the round before
             clock = time.perf_counter()
             horizon = min(t.planned, skills - i)  # no plan looks beyond the end of the episode
             z, path = plan(u, t.reward, t.samples, horizon, pool, s0)       # lines 2 to 12
@@ -164,7 +166,7 @@ def run(u):
             chosen.append(z)
         commands = commands_of(u.policy, torch.stack(chosen), u.length)     # lines 17 and 18
         for _ in execute(u.policy, robots, commands, u.hold, closed, deterministic=closed):  # lines 13 to 19
-            poses.append(robots.qpos.copy())                                # line 20
+            poses.append(robots.qpos.copy())  # for figures
 
     rows = []
     for n, t in enumerate(trials):
@@ -317,7 +319,8 @@ def drive(u):
 
 # ---------------------------------------------------------------- what is planned: rows, flags, checks
 
-OF_A_RUN = "EXPERIMENT OUT THREADS DRAW METHOD MAZES DRIVE SECONDS PORT".split()  # no other row sets these
+# rows of MAZE and METHODS may not set these
+OF_A_RUN = "EXPERIMENT OUT THREADS DRAW METHOD MAZES DRIVE SECONDS PORT".split()
 load_once = cache(common.load_policy)
 
 
@@ -366,8 +369,10 @@ def units_of(config, given):
                 print(f"{title} is left out: no {name} of 03_train_policy.py --experiment {shared.policy}")
                 continue
             policy = load_once(OUT, shared.policy, seed)
-            if policy.robot != "ant" or policy.method == "dads" and (mode, shared.length) != ("printed", 1):
-                stop(f"{title}: mazes are for the ant; DADS has no closed loop, and a --length of 1")
+            if policy.robot != "ant" or mode == "closed" and not policy.names:
+                stop(f"{title}: mazes are for the ant, the closed loop for WEDIS alone")
+            if policy.method == "dads" and shared.length > 1:
+                stop(f"{title}: DADS predicts one step: --length 1")
             u = SimpleNamespace(**vars(shared) | dict(mode=mode, policy_seed=seed, title=title))
             del u.modes, u.policy_seeds  # what else is planned changes no result
             following = common.FEEDBACK, common.CORRECTION, common.FASTEST, common.SOFT_START

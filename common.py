@@ -1,8 +1,8 @@
 """What two or more stages share, in the order in which a reader meets it:
 command line, artifacts and CSV, weak labels and factors, decoder, robot, actor, execution, plots.
 
-Units: trajectory units for decoder displacements (one transition is at most 1), metres and radians in the
-world, `scale` metres per trajectory unit and environment step, 0.05 s per environment step.
+Units: trajectory units for decoder displacements (a fast transition is 1), metres and radians in the world,
+`scale` metres per trajectory unit and environment step, 0.05 s per environment step.
 """
 import argparse
 import contextlib
@@ -70,8 +70,9 @@ def convert(value, like, name, least=0):
 def parse_flags(stage, argv=None):
     """Make each `NAME = value # comment` at the top of a stage (its globals()) a flag --name, and set it. A
     row of EXPERIMENTS overrides it, a flag both. Returns {NAME: value}, and the flags' alone."""
+    hint = "; --resume true goes on from the last checkpoint" if "RESUME" in stage else ""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop("stopped; --resume true goes on from the last checkpoint", 1))
+        signal.signal(number, lambda *_: stop("stopped" + hint, 1))
     if hasattr(signal, "SIGPIPE"):
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # piped into head: end as other programs do
     parser = argparse.ArgumentParser(description=stage["__doc__"], allow_abbrev=False,
@@ -205,7 +206,7 @@ CLASSES = dict(speed=4, direction=4, curvature=3, acceleration=3, x=4, y=4)  # o
 
 def weak_labels(factors, names, ranges):
     """Weak labels, App. A.1.1, A.3.1, Fig 9: factors {name: (N,)}, ranges {name: (low, high)} -> (N, M) int64
-    classes from 0. Curvature, acceleration: none, positive, negative; the others: quarters of their range."""
+    classes from 0. Curvature, acceleration: zero, positive, negative; the others: quarters of their range."""
     labels = []
     for name in names:
         if name in MULTI:
@@ -238,7 +239,7 @@ def factors_of(displacement, names):
 
 
 def spread(values, name):
-    """Range of a factor's values (n,); of directions, which close in a circle, all but the largest gap."""
+    """Range of a factor's values (n,); for directions, which are on a circle, 2 pi less the largest gap."""
     if name != "direction":
         return np.ptp(values)
     angles = np.sort(values % (2 * math.pi))
@@ -268,7 +269,7 @@ def layers(n_in, hidden, n_out):
 class Decoder(nn.Module):
     """p_theta(tau | z), Fig 1: an LSTM over z and its own last mean -> a Gaussian over the next displacement.
     The trap: a decoder that reads the true last displacement needs no z, and z stays entangled. circle: index
-    of a latent that is an angle, of which -1.5 and 1.5 are the same."""
+    of a latent that is an angle, a whole turn from -1.5 to 1.5, the ends of a traversal."""
 
     def __init__(self, z_dim, x_dim, hidden, circle=None):
         super().__init__()
@@ -311,7 +312,7 @@ def unpack(packed):
 
 def next_skill(z, names, relation):
     """The relation functions f, Sec. 4.2.2, 6.1.2, A.3.2: z (..., M) of one transition -> of the next. names
-    of the axes; relation {factor of z_multi: weight} (the paper, by hand: -0.2, 0.1)."""
+    of the axes; relation {factor of z_multi: weight} (the paper: -0.2, -0.1 by hand; signs are its axes')."""
     z = z.clone()
     for factor, weight in relation.items():
         change = weight * z[..., names.index(factor)]
@@ -411,7 +412,7 @@ def rotate(v, angle):
 
 def to_base_frame(s, c):
     """State (B, 27) of Robots.observe and command (B, 2), turned by the torso's heading -> (B, 26), (B, 2).
-    Physics knows no north: what is learnt for one heading is learnt for all."""
+    The dynamics do not depend on the heading: what is learnt for one holds for all."""
     half = torch.atan2(s[:, 4], s[:, 1])  # half the heading: (w, 0, 0, z) is a turn about the vertical
     upright = torch.hypot(s[:, 1], s[:, 4])[:, None]
     tilt, velocity = rotate(s[:, 2:4], -half), rotate(s[:, 13:15], -2 * half)
@@ -427,7 +428,7 @@ class Actor(nn.Module):
         super().__init__()
         self.arguments = (s_dim, c_dim, a_dim, hidden, base_frame)
         self.base_frame = base_frame
-        s_dim -= base_frame  # a turned quaternion has no fourth number
+        s_dim -= base_frame  # without the heading a quaternion has three numbers
         self.net = layers(s_dim + c_dim, hidden, 2 * a_dim)
         self.register_buffer("s_mean", torch.zeros(s_dim))
         self.register_buffer("s_std", torch.ones(s_dim))
@@ -462,7 +463,7 @@ SOFT_START = 20    # environment steps over which the longest command grows from
 
 
 def closed_loop(c, reference, robots, scale):
-    """Commands (n, 2 or 1) of robots that should be at reference, metres, and go on by c, units."""
+    """Commands (n, 2 or 1), trajectory units: c and a share of reference - place, both in metres."""
     correction = FEEDBACK * (reference - robots.place()) / scale
     c = c + correction * (CORRECTION / correction.norm(dim=1, keepdim=True).clamp(min=CORRECTION))
     longest = (0.2 + (FASTEST - 0.2) * robots.age() / SOFT_START).clamp(max=FASTEST)

@@ -30,7 +30,7 @@ KEYS = {  # of each results file: the columns that name a row, or a group of row
 DECODERS = ("main", "main_none", "full_circle", "speed_acc")  # that policies and Fig 4 need
 CORES = {"1": "one core, another training beside it", "2": "two cores"}
 LARGEST = 2_000_000  # bytes of a shipped file
-NOT_YET = "not measured yet with this edition"
+NOT_YET = "not measured yet"
 PANELS = [(maze, kind) for maze in ("maze1", "maze2") for kind in ("dense", "sparse")]
 METHODS = [("wedis", "printed"), ("wedis", "closed"), ("wedis_s", "printed"), ("wedis_nts", "printed"),
            ("dads", "printed"), ("sectar", "printed")]
@@ -163,7 +163,7 @@ def picture(name, title, folder=""):
 def gifs():
     found = [picture(f"{maze}.gif", f"The Ant crosses {NAMES[maze]}") for maze in ("maze1", "maze2")]
     if not all(found):
-        return ["*The GIFs of the Ant in both mazes are not made yet with this edition: `python 04_mpc_maze.py`.*"]
+        return ["*The GIFs of the Ant in both mazes are not made yet: `python 04_mpc_maze.py`.*"]
     return markdown(["Maze 1", "Maze 2"], [[found[0][0], found[1][0]]])
 
 
@@ -314,7 +314,7 @@ def skill_claims():
         row("the three factors are suitably disentangled (Fig 4)", main[1] >= CLEAR, main[0]),
         row("without labels they are entangled, one axis is unused", none[1] == 0, none[0]),
         row("both beta and gamma need proper choices (Fig 10)", grid[9, 10][1] > max(grid[key][1] for key in grid if key != (9, 10)),
-            "; ".join(f"({b}, {g}) {text}" for (b, g), (text, _) in grid.items())),
+            "beta, gamma: " + "; ".join(f"{b}, {g}: {text}" for (b, g), (text, _) in grid.items())),
         row("other labels give other axes (Fig 11)", min(polar[1], cartesian[1]) >= CLEAR,
             f"polar {polar[0]}, Cartesian {cartesian[0]}, none {xy[0]}"),
         row("speed and acceleration in 1D (Fig 12)", line[1] >= CLEAR, line[0]),

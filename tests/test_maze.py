@@ -178,7 +178,7 @@ def test_a_scaled_arc_has_its_closed_form(s4):
 
 
 def test_rewards_are_those_of_sec_62(s4):
-    u = SimpleNamespace(goal=(10.0, 0.0), walls=[(20, 21, -5, 5), (4, 5, 2, 9)], radius=1.0, penalty=100.0, reward=5.0,
+    u = SimpleNamespace(goal=(10.0, 0.0), walls=[(20, 21, -5, 5), (4, 5, 2, 9)], radius=1.0, penalty=100.0, reward_weight=5.0,
                         epsilon=3.0)
     path = torch.tensor([[[0.0, 0], [6, 0], [10, 4]],       # free, ends 4 m away
                          [[0.0, 0], [6, 0], [12, 0]],       # free, ends 2 m away
