@@ -1,10 +1,10 @@
 """Stage 3: decoder -> skill policy pi(a | s, c), trained by SAC on single steps (Sec. 4.2, Alg. 1, A.1.3).
 
-Reads runs/wetvae_*.pt of stage 2. A skill z_single asks for a step: the decoder's first displacement, here
-called the command c. The reward is the decoder's log-likelihood of the step that the robot makes (Eq. 6).
+Reads runs/wetvae_*.pt of stage 2. The command c of a skill z_single is the decoder's first displacement. The
+reward is the decoder's log-likelihood of the step that the robot makes (Eq. 6).
 Writes runs/policy_<experiment>_seed<seed>.pt, Fig 5, 14 (15, 16) and a row of runs/results/policies.csv.
 Takes 16 minutes on two cores (timed once, ant_full). Expect, mean of 3 seeds: tracking error 0.14 in open
-loop, 0.11 in closed loop; there 0.09 m off after a skill of 200 steps (median), and 1.5 % turn over in three.
+loop, 0.05 in closed loop; there, median following error 0.07 m, and 0.4 % of the robots turn over.
 """
 import copy
 import math
@@ -663,15 +663,18 @@ def draw_skills(policy):
         z = traversal(policy, i, values)
         paths = [predicted_path(policy, z, run)]
         paths += [roll_out(policy, z, run, closed) for closed in (False, True)[:len(rows) - 1]]
-        reach = 1.05 * max(abs(path).max() for path in paths)  # one scale for all rows of a column
+        places = np.concatenate([path.reshape(-1, path.shape[2]) for path in paths])
+        low, high = places.min(0), places.max(0)
+        reach = 0.6 * (high - low).max() + 0.01  # one scale for all rows of a column
+        limits = [(middle - reach, middle + reach) for middle in (low + high) / 2]
         for ax, path in zip(axes[:, i], paths):
-            ax.set_xlim(-reach, reach)
+            ax.set_xlim(limits[0])
             marks = path[:, ::1 if path is paths[0] else run[1]]
             if rail:
                 for t, colour in enumerate(plt.get_cmap("plasma")(np.linspace(0, 0.85, marks.shape[1]))):
                     ax.plot(marks[:, t, 0], values, ".", color=colour, label=f"t = {t}")
                 continue
-            ax.set(ylim=(-reach, reach), aspect="equal")
+            ax.set(ylim=limits[1], aspect="equal")
             for line, dots, value, colour in zip(path, marks, values, colours):
                 ax.plot(*line.T, color=colour, lw=1.3, label=f"{value:g}")
                 ax.plot(*dots.T, "o", ms=3 if len(dots) < 10 else 0, color=colour)
