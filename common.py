@@ -46,7 +46,7 @@ def stop(message, code=2):
 
 def convert(value, like, name, least=0):
     """value (a flag's text, or what a file says) -> the type of `like`. Exits with 2 if it does not fit.
-    Whole numbers are at least 1 (0 where the file says 0, and for seeds); others at least `least`."""
+    Whole numbers are at least 1, but seeds and ports 0; others at least `least`."""
     kind, text = type(like), str(value).lower()
     if kind is str:
         return str(value)
@@ -56,13 +56,13 @@ def convert(value, like, name, least=0):
         parts = value if isinstance(value, tuple) else text.split()
         if len(parts) == len(like):
             return tuple(convert(part, one, name, -1e9) for part, one in zip(parts, like))
-    if kind is int and like > 0 and least == 0 and not name.lower().endswith("seed"):
+    if kind is int and least == 0 and not name.lower().endswith(("seed", "seeds", "port")):
         least = 1
     with contextlib.suppress(ValueError):
         number = float(text)
         if kind in (int, float) and least <= number < math.inf and number == kind(number):
             return kind(number)
-    kinds = {bool: "true or false", int: f"a whole number of at least {least}",
+    kinds = {bool: "true or false", int: f"a whole number of at least {least} (0.0 if it is no count)",
              float: f"a number of at least {least:g}", tuple: f"{np.size(like)} numbers"}
     stop(f"{name} is {value!r}, but must be {kinds[kind]}")
 

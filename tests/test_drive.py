@@ -6,6 +6,8 @@ import signal
 import socket
 import subprocess
 import sys
+import time
+import urllib.error
 import urllib.request
 from pathlib import Path
 
@@ -39,6 +41,16 @@ def port_of(process):
     raise AssertionError(process.stderr.read())
 
 
+def opened(port):
+    """The page; on a busy machine its address is printed a moment before the server listens."""
+    for _ in range(50):
+        try:
+            return urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=20)
+        except urllib.error.URLError:
+            time.sleep(0.1)
+    raise AssertionError("nothing listens")
+
+
 def listening(pid):
     """Local addresses, as the kernel writes them, of all sockets on which a process listens."""
     inodes = {os.readlink(link) for link in Path(f"/proc/{pid}/fd").iterdir() if link.is_symlink()}
@@ -52,7 +64,7 @@ def test_the_page_is_for_this_machine_alone_and_ctrl_c_ends_it(folder):
     process = run(folder, "--port", "0")
     try:
         port = port_of(process)
-        page = urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=20)
+        page = opened(port)
         assert page.status == 200 and b"<html" in page.read().lower()
         sockets = listening(process.pid)
         assert any(int(local.split(":")[1], 16) == port for local in sockets)

@@ -486,7 +486,7 @@ def test_without_a_gl_library_one_line_says_so(out):
     (dict(samples="10 0"), "--samples is '0', but must be a whole number of at least 1"),
     (dict(samples="10 x"), "--samples is 'x', but must be a whole number"), (dict(samples=""), "--samples is '0'"),
     (dict(look_ahead="200 0"), "--look_ahead is '0', but must be a whole number of at least 1"),
-    (dict(policy_seeds="-1"), "--policy_seed is '-1', but must be a whole number of at least 0"),
+    (dict(policy_seeds="-1"), "--policy_seeds is '-1', but must be a whole number of at least 0"),
     (dict(policy_seeds=""), "there is nothing to plan: choose"),
     (dict(trials=0), "--trials is '0', but must be a whole number of at least 1"),
     (dict(episode=100), "wedis in maze1: an episode has 100 steps, but one skill 200"),
@@ -510,6 +510,6 @@ def test_rows_that_make_no_sense_get_one_line(s4, stage, table, row, line):
 
 
 def test_a_policy_of_another_method_is_named(stage):
-    done = stage(policy="ant_dads", mazes="maze1", modes="printed")
+    done = stage(policy="ant_dads", mazes="maze1", modes="printed", length=1)
     assert done.code == 0, done.err
     assert "wedis printed, maze1, ant_dads seed 0" in done.out

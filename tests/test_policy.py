@@ -468,7 +468,7 @@ def test_a_row_of_ones_own_and_measuring_flags(s3, inside, out):
     assert inside(s3, *flags).returncode == 0
     policy = common.load_policy(out, "mine", 0)
     assert policy.config["TEMPERATURE"] == 0.01 and policy.config["ROBOTS"] == 4
-    more = "--resume true --starts 2 --directions 4 --traversal 5 --z_range 1 --noisy 1 --figure x".split()
+    more = "--resume true --starts 2 --directions 4 --traversal 5 --noisy 1 --figure x".split()
     for extra in (more, [*more, "--train", "false"]):
         assert inside(s3, *flags, *extra).returncode == 0
     done = inside(s3, *flags, "--resume", "true", "--hidden", 24)
