@@ -1,4 +1,4 @@
-"""Speed against what a user would take instead, by hand on an idle machine: `pip install stable-baselines3` first.
+"""Speed against what a user would take instead, by hand on an idle machine: `pip install stable-baselines3 imageio` first.
 
 python tests/bench.py            3 minutes. Critic updates/s at two layers of 256 and batches of 256 against Stable-Baselines3's
                                  gradient steps (ours: actor and value network in each second one); environment steps/s against
