@@ -80,8 +80,8 @@ NOISY = 16               # noisy starts over which an executed skill is averaged
 STARTS = 400             # noisy starts of the following error
 FIGURE = ""              # name of the figure of skills ("": skills_<experiment>)
 
-SECTAR = dict(METHOD="sectar", Z_DIM=8, SKILL_STEPS=50, RECENT=512_000, MODEL_BATCH=128, REWARD_SCALE=0.3,
-              SINGLE_RUN=(50, 1), MULTI_RUN=(50, 1))
+SECTAR = dict(METHOD="sectar", UPDATES=66_000, Z_DIM=8, SKILL_STEPS=50, RECENT=512_000, MODEL_BATCH=128,
+              REWARD_SCALE=0.3, SINGLE_RUN=(50, 1), MULTI_RUN=(50, 1))  # as many minutes as WEDIS
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
     "ant_semi": dict(FIGURE="fig05_skills_wedis"),
     "ant_full": dict(DECODER="full_circle", DIRECTIONS=16, FIGURE="fig15_full_circle"),
