@@ -53,6 +53,8 @@ def check(names, limits):
     """End with one line if these constants make no data set from which the factors can be learnt."""
     if "speed" not in names or not set(names) <= set(limits):
         stop(f"--factors {FACTORS!r} must name speed, and besides it only {' '.join(limits)}")
+    if SPEED_LOW and "direction" not in names:
+        stop("--speed_low needs direction in --factors: in one dimension speeds go both ways, from 0 on")
     if max(DIRECTION, CURVATURE) > 180:
         stop("--direction and --curvature must be at most 180")
     for name in names:

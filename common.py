@@ -62,9 +62,10 @@ def convert(value, like, name, least=0):
         number = float(text)
         if kind in (int, float) and least <= number < math.inf and number == kind(number):
             return kind(number)
-    kinds = {bool: "true or false", int: f"a whole number of at least {least} (0.0 if it is no count)",
+    kinds = {bool: "true or false", int: f"a whole number of at least {least}",
              float: f"a number of at least {least:g}", tuple: f"{np.size(like)} numbers"}
-    stop(f"{name} is {value!r}, but must be {kinds[kind]}")
+    hint = "; a share or weight of nothing is 0.0" if text == "0" else ""
+    stop(f"{name} is {value!r}, but must be {kinds[kind]}{hint}")
 
 
 def parse_flags(stage, argv=None):
