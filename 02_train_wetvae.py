@@ -124,6 +124,11 @@ class LabelDecoders(nn.Module):
 
 # ------------------------------------------------ the objective and its training, Eq. 4 and Alg. 1
 
+def log_normal(x, mean, log_var):
+    """log N(x; mean, exp(log_var)), elementwise. The trap: torch's gaussian_nll_loss bounds the variance."""
+    return -0.5 * ((x - mean) ** 2 * torch.exp(-log_var) + log_var + math.log(2 * math.pi))
+
+
 def divergence(mean, log_var, circle):
     """D_KL(q(z | tau, y) || p(z)) of each latent (B, z_dim). p is N(0, 1); of an angle it is uniform over the
     turn; noise is treated as if it did not wrap, which is at most 0.1 too little."""
@@ -139,9 +144,8 @@ def objective(encoder, decoder, label_decoders, x, one_hot, y):
     x (B, T, x_dim) displacements; the labels as one_hot (B, y_dim), side by side, and as classes y (B, M)."""
     mean, log_var = encoder(x, one_hot)
     z = mean + torch.randn_like(mean) * (0.5 * log_var).exp()  # z ~ q(z | tau, y)
-    step, step_log_var = decoder(z, x.shape[1])
     # sum_t log p(s_t | s_1:t-1, z); in the place of s_1:t-1 the decoder reads its own means
-    states = -F.gaussian_nll_loss(step, x, step_log_var.exp(), full=True, reduction="sum") / len(x)
+    states = log_normal(x, *decoder.unroll(z, x.shape[1])).sum((1, 2)).mean()
     logits = label_decoders(z)
     labels = -sum(F.cross_entropy(logits[m], y[:, m]) for m in range(len(logits)))  # sum_m log p(y^m | z)
     return states, labels, divergence(mean, log_var, decoder.circle).sum(1).mean()
@@ -194,7 +198,7 @@ def check_factors(decoder, names, steps):
     z = torch.randn(5000, n, generator=torch.Generator().manual_seed(0))
     if decoder.circle is not None:
         z[:, decoder.circle] = torch.linspace(-1.5, 1.5, len(z))
-    found = list(factors_of(decoder(z, steps)[0].double().numpy(), names).values())
+    found = list(factors_of(decoder.unroll(z, steps)[0].double().numpy(), names).values())
     with np.errstate(invalid="ignore", divide="ignore"):  # a factor that never changes has no correlation
         corr = np.nan_to_num(np.corrcoef(z.double().numpy().T, found)[:n, n:])  # latents x factors
     best = list(max(itertools.permutations(range(n)), key=lambda order: abs(corr[order, range(n)]).sum()))

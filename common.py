@@ -281,9 +281,12 @@ class Decoder(nn.Module):
         self.register_buffer("axes", torch.eye(z_dim))  # canonical z -> latents: a signed permutation
 
     def forward(self, z, steps):
-        """z (B, M) -> mean and log-variance of displacements, (B, steps, x_dim) each. In training z are the
-        latents; after 02 axis m is factor m, and + is more of it."""
-        z, i = z @ self.axes, self.circle
+        """Canonical z (B, M): axis m is factor m, + is more of it -> as unroll."""
+        return self.unroll(z @ self.axes, steps)
+
+    def unroll(self, z, steps):
+        """Latents z of training (B, M) -> mean and log-variance of displacements, (B, steps, x_dim) each."""
+        i = self.circle
         if i is not None:
             z = torch.cat([z[:, :i], on_circle(z[:, i]), z[:, i + 1:]], 1)
         mean, state, means, log_vars = z.new_zeros(len(z), self.x_dim), None, [], []
