@@ -81,7 +81,7 @@ STARTS = 400             # noisy starts of the following error
 FIGURE = ""              # name of the figure of skills ("": skills_<experiment>)
 
 SECTAR = dict(METHOD="sectar", UPDATES=66_000, Z_DIM=8, SKILL_STEPS=50, RECENT=512_000, MODEL_BATCH=128,
-              REWARD_SCALE=0.3, SINGLE_RUN=(50, 1), MULTI_RUN=(50, 1))  # as many minutes as WEDIS
+              REWARD_SCALE=1.0, SINGLE_RUN=(50, 1), MULTI_RUN=(50, 1))  # as many minutes as WEDIS
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
     "ant_semi": dict(FIGURE="fig05_skills_wedis"),
     "ant_full": dict(DECODER="full_circle", DIRECTIONS=16, FIGURE="fig15_full_circle"),
@@ -470,7 +470,7 @@ EXPLORER = 3.0  # last entry of the z of SeCTAR's explorer: far from N(0, I), an
 def train_sectar(run):
     """Co-Reyes et al. 2018: skills z ~ N(0, I); the VAE learns from the trajectories of an explorer, the same
     policy with commands of length 3 in any direction. Reward of a skill: the likelihood of ending where
-    the decoder says; of the explorer: what the VAE cannot reconstruct."""
+    the decoder says; of the explorer: how far along its command the VAE cannot reconstruct."""
     encoder, decoder = run.model["encoder"], run.decoder
 
     def elbo(x):
@@ -523,8 +523,8 @@ def train_sectar(run):
                 # Laplace likelihood of the place where a trajectory ends, shared among its steps. The trap:
                 # the likelihood of single steps is highest for a robot that stands still
                 error = x - decoded
-                along = (error * nn.functional.normalize(error.sum(1))[:, None]).sum(2)
-                r = REWARD_SCALE * torch.where(explorer[:, None], along, -along)
+                direction = torch.where(explorer[:, None], z[:, :2], -error.sum(1))
+                r = REWARD_SCALE * (error * nn.functional.normalize(direction)[:, None]).sum(2)
                 c = steps_of(z, decoded)
                 c2 = torch.cat([c[:, 1:], c[:, -1:]], 1)
                 s, a, s2, r, c, c2 = (v.flatten(0, 1) for v in (s, a, s2, r, c, c2))
@@ -693,6 +693,7 @@ def draw_robots():
     for ax, name in zip(axes, ("ant", "half_cheetah")):
         model = robot_spec(name).compile()
         model.stat.extent = 2.2  # metres, what the default camera shows
+        model.vis.map.shadowclip = 2  # or the floor is speckled
         data = mujoco.MjData(model)
         mujoco.mj_resetDataKeyframe(model, data, 0)
         mujoco.mj_forward(model, data)

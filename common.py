@@ -113,9 +113,10 @@ def write_whole(path, data):
             os.fsync(file.fileno())  # before it takes the name: a power cut leaves no empty artifact
         os.replace(partial, path)  # atomic
     except OSError as error:
+        stop(f"cannot write {path}: {error.strerror}; free the space or choose another --out", code=1)
+    finally:  # it is there if the disk is full, or if somebody stops the program
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
-        stop(f"cannot write {path}: {error.strerror}; free the space or choose another --out", code=1)
     return path
 
 
@@ -460,7 +461,8 @@ class Actor(nn.Module):
         return self(self.inputs(s, c), deterministic)[0]
 
 
-FEEDBACK = 0.1     # closed loop: share of the distance to the reference that each command adds (the paper: 0)
+FEEDBACK = 0.1     # closed loop: share of the distance to the reference that each command adds, a slow one up
+                   # to twice as much (the paper: 0)
 CORRECTION = 0.2   # at most so much, trajectory units
 FASTEST = 1.0      # no command is longer, trajectory units: much longer ones than in training make falls
 SOFT_START = 20    # environment steps over which the longest command grows from 0.2 to FASTEST
@@ -468,7 +470,8 @@ SOFT_START = 20    # environment steps over which the longest command grows from
 
 def closed_loop(c, reference, robots, scale):
     """Commands (n, 2 or 1), trajectory units: c and a share of reference - place, both in metres."""
-    correction = FEEDBACK * (reference - robots.place()) / scale
+    share = FEEDBACK * (2 - c.norm(dim=1, keepdim=True).clamp(max=1))
+    correction = share * (reference - robots.place()) / scale
     c = c + correction * (CORRECTION / correction.norm(dim=1, keepdim=True).clamp(min=CORRECTION))
     longest = (0.2 + (FASTEST - 0.2) * robots.age() / SOFT_START).clamp(max=FASTEST)
     return c * (longest / torch.maximum(c.norm(dim=1, keepdim=True), longest))

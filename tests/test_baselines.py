@@ -129,6 +129,8 @@ def sectar(s3):
 
 
 def test_one_pass_of_sectar_pays_the_place_where_a_trajectory_ends(s3, sectar):
+    sectar.model["encoder"][-1].weight.data[4:] = 0  # q(z | tau) without noise
+    sectar.model["encoder"][-1].bias.data[4:] = -40
     s3.train_sectar(sectar)
     stored = {(int(row[0]), int(row[1])): row for row in sectar.replay}
     x, x2, r = sectar.sac.kept()
@@ -139,9 +141,12 @@ def test_one_pass_of_sectar_pays_the_place_where_a_trajectory_ends(s3, sectar):
         first = step - t
         assert first + 4 < sectar.steps  # a trajectory that is whole
         path = torch.stack([stored[first + i, robot][7:9] for i in range(5)]) / 0.1
-        if robot < 2:  # the explorer: its command is its own, its decoded path is drawn from the encoder
+        if robot < 2:  # the explorer: its command is its own, its decoded path is the encoder's
             explored += 1
             torch.testing.assert_close(one[3:], z[:2])
+            mean = sectar.model["encoder"](path.flatten())[:4].detach()
+            miss = path - sectar.decoder(mean[None], 5)[0][0].detach()
+            assert found.item() == pytest.approx(0.3 * float(miss[t] @ z[:2]) / 3, abs=1e-5)
             continue
         decoded = sectar.decoder(z[None], 5)[0][0].detach()
         miss = path - decoded

@@ -216,3 +216,14 @@ def test_two_processes_write_the_same_files_at_once(tmp_path):
     assert [writer.exitcode for writer in writers] == [0, 0]
     rows = {(row["a"], int(row["n"])) for row in common.read_csv(tmp_path / "t.csv")}
     assert rows == {(name, i) for name in "ab" for i in range(40)} and not list(tmp_path.glob("*.partial"))
+
+
+@pytest.mark.parametrize("end", [SystemExit(1), OSError(28, "No space left on device")])
+def test_a_write_that_is_stopped_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, end):
+    def fail(descriptor):
+        raise end
+    path = common.write_whole(tmp_path / "a.npz", b"old")
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(SystemExit):
+        common.write_whole(path, b"new")
+    assert [file.name for file in tmp_path.iterdir()] == ["a.npz"] and path.read_bytes() == b"old"

@@ -406,7 +406,10 @@ def numbers(monkeypatch):
 
 
 @pytest.mark.parametrize("c, reference, age, expected", [
-    ((0.3, 0.0), (0.1, 0.0), 1000, (0.4, 0.0)),        # FEEDBACK 0.1 of one trajectory unit
+    ((0.3, 0.0), (0.1, 0.0), 1000, (0.47, 0.0)),       # FEEDBACK 0.1, 1.7 times, of one trajectory unit
+    ((0.0, 0.0), (0.1, 0.0), 1000, (0.2, 0.0)),        # twice as much if the command is 0
+    ((2.5, 0.0), (0.0, 0.1), 1000, (0.849321, 0.033973)),  # never less than FEEDBACK
+    ((0.8, 0.0), (0.02, 0.0), 1000, (0.824, 0.0)),
     ((0.3, 0.0), (0.0, 5.0), 1000, (0.3, 0.2)),        # CORRECTION: at most 0.2
     ((3.0, 4.0), (0.0, 0.0), 1000, (0.51, 0.68)),      # FASTEST: 0.85 long
     ((3.0, 4.0), (0.0, 0.0), 0, (0.12, 0.16)),         # soft start: 0.2 long
@@ -424,7 +427,7 @@ def test_execute_holds_commands_open_and_closed(numbers):
     torch.testing.assert_close(torch.cat(robots.asked), commands[0].repeat_interleave(3, 0))  # open loop: unchanged
     still = Fake(share=0.0)
     list(common.execute(policy, still, commands[:, :1], 3, True, True))
-    torch.testing.assert_close(torch.cat(still.asked)[:, 0], torch.tensor([0.5, 0.55, 0.6]))  # 0.5 behind a step
+    torch.testing.assert_close(torch.cat(still.asked)[:, 0], torch.tensor([0.5, 0.575, 0.65]))  # 0.5 behind a step
 
 
 # ---------------------------------------------------------------- measures
