@@ -332,9 +332,10 @@ def planning_claims():
     for row in results("claims"):
         found.setdefault(row["claim"], {}).setdefault(row["mode"], []).append(row["verdict"])
     for words, modes in found.items():
-        rows.append([words, "; ".join(f"{NAMES[mode]}: " + ", ".join(
-            f"{verdict} {verdicts.count(verdict)}" for verdict in ("holds", "undecided", "does not hold"))
-            for mode, verdicts in modes.items())])
+        cells = [f"{NAMES[mode]} " + " / ".join(str(verdicts.count(verdict))
+                                          for verdict in ("holds", "undecided", "does not hold"))
+                 for mode, verdicts in modes.items()]
+        rows.append([words, ", ".join(cells)])
     return rows
 
 
@@ -350,7 +351,7 @@ def ten_seeds():
 
 def claims():
     rows = planning_claims()
-    return markdown(["the paper says", "here: purity of each axis (-: unused), or number of comparisons"],
+    return markdown(["the paper says", "here: purity of each axis (-: unused), or comparisons: hold / undecided / do not hold"],
                     skill_claims() + rows) + ten_seeds() + ([] if rows else ["", *missing(
                         "The claims on planning (Sec. 6.2.1) are", "python 04_mpc_maze.py --experiment figure7")])
 
