@@ -4,7 +4,7 @@ In: policy_<POLICY>_seed<n>.pt of stage 3. Out: <OUT>/results/<EXPERIMENT>.csv, 
   python 04_mpc_maze.py                          Fig 3, 6, 8, 17 and GIFs, 56 s on two cores
   python 04_mpc_maze.py --experiment figure7     or another row of EXPERIMENTS below
 Expect, mean final distance of 3 policies x 50 trials (dense maze 1, 2; sparse maze 1, 2): 4.1, 2.0, 4.7,
-4.8 m as printed; 0.8, 0.6, 3.6, 3.5 m in closed loop. The start is 26.8 m from the goal.
+4.8 m as printed; 0.8, 0.5, 3.6, 3.5 m in closed loop. The start is 26.8 m from the goal.
 """
 import hashlib
 import io
