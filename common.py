@@ -83,7 +83,9 @@ def parse_flags(stage, argv=None):
     values, source = {}, Path(stage["__file__"]).read_text(encoding="utf-8")
     for name, text, comment in re.findall(r"^([A-Z_]+) = (.*?)(?:  +# (.*))?$", source, re.MULTILINE):
         if isinstance(stage[name], (bool, int, float, str, tuple)):
-            values[name] = int(stage[name]) if re.fullmatch(r"\d+e\d+", text) else stage[name]  # 1e4
+            values[name] = stage[name]
+            if isinstance(stage[name], float) and stage[name].is_integer() and "." not in text:
+                values[name] = int(stage[name])  # 1e4, 512 / 2
             parser.add_argument("--" + name.lower(), dest=name, metavar=type(values[name]).__name__,
                                 help=f"{comment} [{values[name]}]".replace("%", "%%"))
     given = vars(parser.parse_args(argv))

@@ -60,6 +60,15 @@ def test_flags_override_rows_and_rows_override_constants(flags):
     assert config == {name: stage[name] for name in "EXPERIMENT SEED OUT N SHARE FLAG START WORDS".split()}
 
 
+@pytest.mark.parametrize("text, value", [("512 / 2", 256), ("2e3", 2000), ("7", 7), ("2.0", 2.0), ("1 / 4", 0.25)])
+def test_whole_numbers_written_without_a_point_are_whole(tmp_path, text, value):
+    path = tmp_path / "stage.py"
+    path.write_text(FILE.format(out=str(tmp_path)).replace("N = 1e4 ", f"N = {text} "))
+    stage = runpy.run_path(str(path)) | dict(__file__=str(path))
+    common.parse_flags(stage, [])
+    assert stage["N"] == value and type(stage["N"]) is type(value)
+
+
 @pytest.mark.parametrize("argv, message", [
     ("--nonsense 1", "unrecognized arguments: --nonsense 1; see --help"),
     ("surplus", "unrecognized arguments: surplus; see --help"),
