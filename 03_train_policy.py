@@ -3,7 +3,7 @@
 Reads runs/wetvae_*.pt of stage 2. The command c of a skill z_single is the decoder's first displacement. The
 reward is the decoder's log-likelihood of the step that the robot makes (Eq. 6).
 Writes runs/policy_<experiment>_seed<seed>.pt, Fig 5, 14 (15, 16) and a row of runs/results/policies.csv.
-Takes 16 minutes on two cores (112 updates/s, tests/bench.py). Expect, mean of 3 seeds: tracking error 0.14
+Takes 12 to 16 minutes on two cores (135 to 112 updates/s). Expect, mean of 3 seeds: tracking error 0.14
 in open loop, 0.04 in closed loop; there, median following error 0.06 m, and 1 % of the robots turn over.
 """
 import copy
