@@ -1,15 +1,16 @@
 """Stage 2: trajectories -> WET-VAE: disentangled skills and their decoder (Sec. 4.1, App. A.1.2).
 
 In: runs/dataset_*.npz of 01. Trains the WET-VAE (Eq. 4) and, to compare, the same model without labels (the
-trajectory VAE), and finds which latent is which factor. Out, below runs/: wetvae_<experiment>_seed<seed>.pt
-(and <experiment>_none), a figure of latent traversals, results/wetvae.csv, results/crosstalk.csv.
-Takes 1 minute, 3.7 with the trajectory VAE (one core). Expect purity 0.91, 0.91, 0.92, mean of 10 seeds.
+trajectory VAE); finds which latent is which factor, and the relation functions. Out, below runs/:
+wetvae_<experiment>_seed<seed>.pt (and .._none), a figure, results/wetvae.csv and crosstalk.csv.
+Takes 35 s, 1.7 minutes with the trajectory VAE (one core). Expect purity 0.91, 0.91, 0.92, mean of 10 seeds.
 """
 import hashlib
 import itertools
 import math
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -17,8 +18,8 @@ from torch import nn
 from torch.nn import functional as F
 
 import common
-from common import (Decoder, check_same, cross_talk, factors_of, load, on_circle, pack, parse_flags, plt,
-                    purity, save, save_figure, spread, stop, unpack, update_csv, weak_labels)
+from common import (MULTI, Decoder, commands_of, cross_talk, factors_of, load, on_circle, parse_flags, plt,
+                    save, save_figure, spread, stop, update_csv, weak_labels)
 
 EXPERIMENT = "main"    # row of EXPERIMENTS below
 SEED = 0               # random seed
@@ -42,6 +43,7 @@ BATCH = 512            # trajectories per update (the paper: 2048)
 EPOCHS = 12            # passes over the data (the paper: 300)
 LEARNING_RATE = 2e-3   # of Adam, falls linearly to 0 (the paper: 2e-4, fixed)
 
+Z_RANGE = 1.5          # ends of the traversals drawn, and of the skills that fit the relation functions
 FIGURE = ""            # name of the figure of traversals ("": traversals_<experiment>)
 MODELS = {"": {}}      # models of a row: end of the file's name, and the constants in which it differs
 COLUMNS = []           # columns of its figure: title, model, T ([]: each model, at the T of the data)
@@ -57,7 +59,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
         f"b{b}_g{g}": dict(BETA=b, GAMMA=g) for b, g in ((9, 0), (9, 1), (1, 10), (3, 10), (9, 10))}),
     "polar": dict(DATA="polar", LABELS="speed direction", FIGURE="fig11_polar_cartesian", MODELS={
         "": {}, "cartesian": dict(LABELS="x y"), "none": NONE | dict(LABELS="x y")}),
-    "speed_acc": dict(DATA="speed_acc", LABELS="speed acceleration", EPOCHS=24, BETA=4.0,
+    "speed_acc": dict(DATA="speed_acc", LABELS="speed acceleration", EPOCHS=24, BETA=4.0, Z_RANGE=1.0,
                       FIGURE="fig12_speed_acceleration", MODELS={"": {}, "none": NONE}),
     "four_factors": dict(DATA="four_factors", LABELS="speed direction curvature acceleration", EPOCHS=60,
                          BETA=4.0, FIGURE="fig13_four_factors", MODELS={"": {}, "circle": dict(CIRCLE=True)}),
@@ -109,7 +111,7 @@ class LabelDecoders(nn.Module):
                 nn.Sequential(nn.Linear(z_dim, hidden), nn.ReLU(), nn.Linear(hidden, size)) for size in sizes)
         for m, name in enumerate(labels):
             self.order.append(torch.arange(0.0, sizes[m])[None])
-            if name in common.MULTI:  # class 0, zero, lies between positive and negative
+            if name in MULTI:  # class 0, zero, lies between positive and negative
                 self.order[m] = torch.tensor([[0.0, 1.0, -1.0]])
             if m == circle:  # the middle of each class, from the left downwards
                 self.order[m] = on_circle(1.5 - 3 / sizes[m] * (self.order[m][0] + 0.5)).T
@@ -158,8 +160,7 @@ def train(networks, data, variant, settings):
     optimizer = torch.optim.Adam(networks.parameters(), lr=settings["LEARNING_RATE"], fused=True)
     done, seconds = 0, 0.0
     if RESUME and (Path(OUT) / common.artifact_name("wetvae-checkpoint", variant, SEED)).exists():
-        state = load(OUT, "wetvae-checkpoint", variant, SEED)
-        check_same(state, settings, FREE)
+        state = load(OUT, "wetvae-checkpoint", variant, SEED, **settings)
         networks.load_state_dict(state["networks"])
         optimizer.load_state_dict(state["optimizer"])
         torch.set_rng_state(state["rng"])
@@ -207,6 +208,26 @@ def check_factors(decoder, names, steps):
     return abs(corr[best, range(n)])
 
 
+@torch.no_grad()
+def find_relation(decoder, names, steps, reach):
+    """Alg. 1, "Test: find relation functions": for each factor of z_multi the weight with which single steps
+    and the relation function (common.next_skill) come nearest to the decoder's free run of `steps`. Returns
+    {factor: weight} and prints how far the two are apart (RMS, as a share of the RMS step)."""
+    grid, relation = torch.linspace(-reach, reach, 13), {}
+    for factor in [name for name in names if MULTI.get(name) in names]:
+        z = torch.zeros(len(grid) ** 2, len(names))  # direction 0: it stays within the range of the data
+        z[:, [0, names.index(factor)]] = torch.cartesian_prod(grid, grid)  # the first axis is the speed
+        free, errors = decoder(z, steps)[0], {}
+        for weight in np.linspace(-1, 1, 401).round(4).tolist():
+            skills = SimpleNamespace(method="wedis", decoder=decoder, names=names, relation={factor: weight})
+            chain = commands_of(skills, z, steps)
+            errors[weight] = ((chain - free).square().mean() / free.square().mean()).sqrt().item()
+        best = relation[factor] = min(errors, key=errors.get)
+        print(f"relation function of {factor}: weight {best:+.3f}, {errors[best]:.1%} from the decoder's "
+              f"free run ({errors[0.0]:.1%} without it)")
+    return relation
+
+
 def weak_supervision(dataset, x, settings):
     """The factors of interest {name: (low, high)}, in the order of z in all stages, and the classes of their
     labels (N, M). Ends with one line if the settings do not fit the data, before anything is trained."""
@@ -236,12 +257,14 @@ def weak_supervision(dataset, x, settings):
 def main():
     config, given = parse_flags(globals())
     torch.set_num_threads(THREADS)
-    models = {key: config | changes | given for key, changes in MODELS.items()}  # flags override rows
-    for key, settings in models.items():
+    models = {}
+    for key, changes in MODELS.items():
+        settings = config | changes | given  # flags override rows
         for name, value in settings.items():
             if name not in config:
                 stop(f"{name} of model {key!r} is no constant of this file")
             settings[name] = common.convert(value, config[name], f"model {key!r}: {name}")
+        models[key] = {name: value for name, value in settings.items() if name not in FREE}
     if TRAIN:
         dataset = load(OUT, "dataset", DATA, DATA_SEED)
         x = torch.from_numpy(np.diff(dataset["trajectories"], axis=1))  # displacements, App. A.1.2
@@ -266,15 +289,12 @@ def main():
             settings["DATASET"] = hashlib.sha256(x.numpy().tobytes()).hexdigest()  # other data, other model
             seconds = train(nn.ModuleList([encoder, decoder, heads]), (x, one_hot, y), variant, settings)
             abs_corr = check_factors(decoder, names, x.shape[1])  # Alg. 1, "Test"
-            same = str(sorted(item for item in settings.items() if item[0] not in FREE | {"SEED"}))
-            model = dict(decoder=pack(decoder), encoder=encoder.state_dict(), names=names, ranges=ranges,
-                         length=x.shape[1], abs_corr=abs_corr.tolist(), seconds=seconds,
-                         settings=hashlib.sha256(same.encode()).hexdigest()[:8])  # the same for all seeds
-            print(f"wrote {save(OUT, 'wetvae', variant, SEED, settings, **model)}")
-            trained[key] = model | dict(config=settings)
-        else:
-            trained[key] = load(OUT, "wetvae", variant, SEED)
-            check_same(trained[key], settings, FREE)
+            relation = find_relation(decoder, names, x.shape[1], settings["Z_RANGE"])  # Alg. 1, last line
+            same = str(sorted(item for item in settings.items() if item[0] not in ("SEED", "Z_RANGE")))
+            save(OUT, "wetvae", variant, SEED, settings, decoder=decoder, encoder=encoder.state_dict(),
+                 names=names, ranges=ranges, relation=relation, length=x.shape[1], seconds=seconds,
+                 abs_corr=abs_corr.tolist(), settings=hashlib.sha256(same.encode()).hexdigest()[:8])
+        trained[key] = load(OUT, "wetvae", variant, SEED, **settings)
         kind = f"WET-VAE {key}" if settings["LABELLED"] else "trajectory VAE"
         trained[key]["title"] = f"{kind}\n{weights}"
         measure(key or EXPERIMENT, trained[key])
@@ -295,15 +315,15 @@ def traverse(decoder, axis, values, steps):
 
 def measure(label, model):
     """Print and save what a model has learnt: a row per factor in results/wetvae.csv, C in crosstalk.csv."""
-    decoder, names, config = unpack(model["decoder"]), model["names"], model["config"]
+    decoder, names, config = model["decoder"], model["names"], model["config"]
     values, reach = np.linspace(-1.5, 1.5, 61), 3.0 if decoder.circle is None else 1.5
     curves = [factors_of(traverse(decoder, i, values, model["length"]), names) for i in range(len(names))]
-    C, rows, cells = cross_talk(curves, model["ranges"]), [], []
+    (C, purity), rows, cells = cross_talk(curves, model["ranges"]), [], []
     same = dict(experiment=EXPERIMENT, seed=SEED, labels=label)
     print(f"axis: cross-talk with {' '.join(names)}; purity, |corr|, decoded factor for z in [-1.5, 1.5]")
     for i, name in enumerate(names):
         curve = np.degrees(curves[i][name]) if name in ("direction", "curvature") else curves[i][name]
-        pure, corr, gap = purity(C, i, i), model["abs_corr"][i], ""
+        pure, corr, gap = purity[i], model["abs_corr"][i], ""
         text = f"z_{name:12s} {' '.join(f'{c:5.2f}' for c in C[i])}   {pure:.3f}   {corr:.3f}"
         text = text.replace("nan", "-") + f"   {curve.min():7.2f} .. {curve.max():.2f}"
         if name == "direction" and np.ptp(model["ranges"][name]) > 6.28:  # empty angles, App. A.3.1
@@ -333,12 +353,12 @@ def draw_traversals(trained):
     width = min(4.5, max(2.6, 9 / len(columns)))
     figure, axes = plt.subplots(len(names), len(columns), squeeze=False, height_ratios=heights,
                                 figsize=(width * len(columns) + 0.9, 0.95 * width * sum(heights) + 0.8))
-    values, dots, lines = np.linspace(-1.5, 1.5, 13), None, None
+    values, dots, lines = np.linspace(-Z_RANGE, Z_RANGE, 13), None, None
     for j, (title, key, steps) in enumerate(columns):
         axes[0, j].set_title(title)
         axes[-1, j].set_xlabel("x (trajectory units)")
         for ax, (i, name) in zip(axes[:, j], enumerate(trained[key]["names"])):
-            paths = traverse(unpack(trained[key]["decoder"]), i, values, steps).cumsum(1)
+            paths = traverse(trained[key]["decoder"], i, values, steps).cumsum(1)
             paths = np.pad(paths, ((0, 0), (1, 0), (0, 0)))
             ax.set_ylabel(f"z_{name}" if trained[key]["config"]["LABELLED"] else f"latent nearest {name}")
             if paths.shape[2] == 1 or name == "acceleration":
@@ -351,7 +371,7 @@ def draw_traversals(trained):
     if dots:
         figure.legend(*dots.legend_elements(fmt="t = {x:g}"), loc="outside lower center", ncols=9)
     if lines:
-        bar = plt.cm.ScalarMappable(plt.Normalize(-1.5, 1.5), "viridis")
+        bar = plt.cm.ScalarMappable(plt.Normalize(-Z_RANGE, Z_RANGE), "viridis")
         figure.colorbar(bar, ax=axes, label="value of the traversed latent (lines)", aspect=40)
     save_figure(figure, OUT, FIGURE or f"traversals_{EXPERIMENT}")
 

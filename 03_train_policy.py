@@ -2,7 +2,7 @@
 
 Reads runs/wetvae_*.pt of stage 2. The command c of a skill z_single is the decoder's first displacement. The
 reward is the decoder's log-likelihood of the step that the robot makes (Eq. 6).
-Writes runs/policy_<experiment>_seed<seed>.pt, Fig 5, 14 (15, 16) and a row of runs/results/policies.csv.
+Writes runs/policy_<experiment>_seed<seed>.pt, Fig 5 (15, 16) and a row of runs/results/policies.csv.
 Takes 12 to 16 minutes on two cores (135 to 112 updates/s). Expect, mean of 3 seeds: tracking error 0.14
 in open loop, 0.04 in closed loop; there, median following error 0.06 m, and 1 % of the robots turn over.
 """
@@ -13,10 +13,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
-from common import (CORRECTION, MULTI, SINGLE, Actor, Decoder, Robots, artifact_name,  # before mujoco
-                    check_same, commands_of, cross_talk, execute, factors_of, first_step, layers, load,
-                    load_policy, pack, parse_flags, plt, purity, robot_spec, save, save_figure, stop, unpack,
-                    update_csv)
+from common import (CORRECTION, HERE, MULTI, SINGLE, Actor, Decoder, Robots, artifact_name,  # before mujoco
+                    commands_of, cross_talk, execute, factors_of, layers, load, parse_flags, plt, save,
+                    save_figure, stop, update_csv)
 import mujoco
 import numpy as np
 import torch
@@ -96,12 +95,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
 MAY_DIFFER = ("OUT TRAIN RESUME THREADS REPORTS UPDATES DIRECTIONS SINGLE_RUN MULTI_RUN TRAVERSAL NOISY "
               "STARTS FIGURE").split()  # from a checkpoint's
 
-
 # ---------------------------------------------------------------- SAC (Haarnoja et al. 2017), App. A.1.3
-
-def adam(parameters):
-    return torch.optim.Adam(parameters, lr=LEARNING_RATE, fused=True)
-
 
 class Critics(nn.Module):
     """Q_1 and Q_2 as one stack of batched matrix products (one call for both): (B, n), (B, m) -> (2, B)."""
@@ -120,19 +114,20 @@ class Critics(nn.Module):
         return (h * self.weights[2].mT).sum(2) + self.biases[2].squeeze(2)  # a matrix product is slower here
 
 
-class Sac:
+class Sac(nn.Module):
     """Actor psi, twin critics, value and target network, with a fixed temperature. average: the policy that
     is kept, a running average of the actor's weights (the actor itself varies from report to report)."""
 
     def __init__(self, s_dim, c_dim, a_dim):
+        super().__init__()
         self.actor = Actor(s_dim, c_dim, a_dim, HIDDEN, BASE_FRAME)
         n_in = self.actor.net[0].in_features
         self.critics = Critics(n_in + a_dim)
         self.value = layers(n_in, HIDDEN, 1)
         self.target = copy.deepcopy(self.value).requires_grad_(False)
         self.average = copy.deepcopy(self.actor).requires_grad_(False)
-        self.critic_adam = adam(self.critics.parameters())
-        self.actor_adam = adam([*self.actor.parameters(), *self.value.parameters()])
+        self.critic_adam = torch.optim.Adam(self.critics.parameters(), fused=True)
+        self.actor_adam = torch.optim.Adam([*self.actor.parameters(), *self.value.parameters()], fused=True)
         self.updates = 0
 
     def normalise(self, s):
@@ -177,7 +172,7 @@ class Sac:
         return loss.item()
 
 
-# ---------------------------------------------------------------- reward
+# ---------------------------------------------------------------- Algorithm 1, policy training
 
 def reward(mean, log_var, displacement, floor):
     """log p of Eq. 6 for one step, (B,), without its normaliser, which depends on the skill alone. mean,
@@ -186,22 +181,20 @@ def reward(mean, log_var, displacement, floor):
     return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * mean) ** 2 / variance).sum(1)
 
 
-# ---------------------------------------------------------------- Algorithm 1, policy training
-
-def train_wedis(run, decoder):
+def train_wedis(run):
     """Alg. 1, the second loop: train run.sac to follow the decoder's single steps."""
-    m1 = run.z.shape[1] - decoder.x_dim
+    x_dim, m1 = run.decoder.x_dim, run.z.shape[1] - run.decoder.x_dim
 
     def draw(n):
         """z_single ~ prior and, side by side, a correction of the command as the closed loop adds it."""
         length = CORRECTION * torch.rand(n, 1).sqrt() * (torch.rand(n, 1) < CORRECTED)
-        correction = length * nn.functional.normalize(torch.randn(n, decoder.x_dim))
+        correction = length * nn.functional.normalize(torch.randn(n, x_dim))
         return torch.cat([torch.randn(n, m1), correction], 1)
 
     def command_of(z):
         """z of draw -> mean and log-variance of the commanded step, (n, 2 or 1) each."""
-        mean, log_var = first_step(decoder, z[:, :m1])  # Alg. 1: z = (z_single, 0)
-        return mean + z[:, m1:], log_var
+        mean, log_var = run.decoder(z[:, :m1], 1)  # Alg. 1: z = (z_single, 0)
+        return mean[:, 0] + z[:, m1:], log_var[:, 0]
 
     while run.sac.updates < UPDATES:
         run.renew(draw(ROBOTS))  # Alg. 1: sample z_single from the prior
@@ -209,34 +202,32 @@ def train_wedis(run, decoder):
         run.act(command)  # Alg. 1: execute actions; the physics runs on the second core from here on
 
         if run.warm():
-            progress = run.sac.updates / UPDATES
-            run.sac.schedule(progress)
-            floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** min(1, max(0, (progress - 0.15) / 0.45))
+            shrunk = min(1, max(0, (run.sac.updates / UPDATES - 0.15) / 0.45))
+            floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** shrunk
             s, a, s2, displacement, z = run.sample(UPDATES_PER_STEP * BATCH)  # Alg. 1: sample a batch
             fresh = torch.rand(len(z), 1) < RELABELLED
             z = torch.where(fresh, draw(len(z)), z)  # any stored step can be judged by any skill
             command, log_var = command_of(z)
             r = reward(command, log_var, displacement, floor)  # Alg. 1: compute the reward, Eq. 6
-            x, x2 = run.sac.actor.inputs(s, command), run.sac.actor.inputs(s2, command)
-            for batch in zip(*(v.split(BATCH) for v in (x, a, x2, r))):
-                loss = run.sac.update(*batch)  # Alg. 1: optimize psi and the critics
-            run.losses = dict(reward=r.mean().item(), loss=loss)
+            run.learn(s, a, s2, command, command, r)  # Alg. 1: optimize psi and the critics with the SAC
         run.collect()  # Alg. 1: the samples go to the replay buffer R
 
 
 class Run:
     """What the three loops share: robots, replay buffer, SAC, clock, reports and checkpoints."""
 
-    def __init__(self, z_dim, c_dim, decoder, names, config, model=None):
+    def __init__(self, decoder, names, z_dim, c_dim, fixed, model=None):
+        self.decoder, self.names, self.fixed = decoder, names, fixed
         self.rng = np.random.default_rng(SEED)
         self.robots = make_robots(ROBOTS, 1)
         self.robots.reset(np.arange(ROBOTS), self.rng)
         s_dim, a_dim = self.robots.observe().shape[1], self.robots.ctrl.shape[1]
-        self.sac = sac = Sac(s_dim, c_dim, a_dim)
-        self.model = nn.ModuleDict(model or {})  # what else a baseline learns
-        self.adam = adam(self.model.parameters()) if model else None
-        networks = nn.ModuleList([sac.actor, sac.critics, sac.value, sac.target, sac.average, self.model])
-        self.parts = [part for part in (networks, sac.critic_adam, sac.actor_adam, self.adam) if part]
+        self.sac = Sac(s_dim, c_dim, a_dim)
+        self.parts = [self.sac, self.sac.critic_adam, self.sac.actor_adam]  # of a checkpoint
+        if model:  # what else a baseline learns
+            self.model = nn.ModuleDict(model)
+            self.adam = torch.optim.Adam(self.model.parameters(), lr=LEARNING_RATE, fused=True)
+            self.parts += [self.model, self.adam]
         self.widths = (s_dim, a_dim, s_dim, self.robots.places, z_dim)  # s, a, s', displacement, z
         block = ROBOTS * SKILL_STEPS
         self.replay = torch.zeros(max(2, REPLAY // block) * block, sum(self.widths))
@@ -244,9 +235,7 @@ class Run:
         self.age = self.rng.integers(0, EPISODE, ROBOTS)  # each robot changes skills at its own time
         if METHOD == "sectar":
             self.age -= self.age % SKILL_STEPS  # together: trajectories are rows of the replay buffer
-        self.steps, self.seconds = 0, 0.0
-        self.curve, self.losses = [], {}
-        self.decoder, self.names, self.config = decoder, names, config
+        self.steps, self.seconds, self.curve, self.losses = 0, 0.0, [], {}
         self.worker, self.clock = ThreadPoolExecutor(1), time.time()
         if RESUME:
             self.resume()
@@ -255,14 +244,6 @@ class Run:
         """Take new skills z (ROBOTS, z_dim) for the robots whose SKILL_STEPS are over."""
         over = torch.from_numpy(self.age % SKILL_STEPS == 0)
         self.z = torch.where(over[:, None], z, self.z)
-
-    def warm(self):
-        """Whether the warm-up is over. At its end the statistics of the state are fixed."""
-        if self.steps * ROBOTS < WARM_UP:
-            return False
-        if self.sac.updates == 0:
-            self.sac.normalise(self.replay[:self.steps * ROBOTS, :self.widths[0]])
-        return True
 
     def act(self, command):
         """Begin one step of all robots: a ~ pi(a | s, c), random during the warm-up. collect ends it."""
@@ -275,28 +256,13 @@ class Run:
             step.result()
         self.begun = s, a, step
 
-    def collect(self):
-        """End the step: fill the replay buffer, start old robots anew, make reports and checkpoints."""
-        s, a, step = self.begun
-        displacement, failed = step.result()
-        rows = (self.steps * ROBOTS + torch.arange(ROBOTS)) % len(self.replay)
-        self.replay[rows] = torch.cat([s, a, self.robots.observe(), displacement, self.z], 1)
-        failed = torch.from_numpy(failed)
-        self.replay[rows[failed]] = self.replay[rows[failed] - ROBOTS]  # they mean nothing: repeat the last
-        self.steps += 1
-        self.age = (self.age + 1) % EPISODE
-        self.robots.reset(np.flatnonzero((self.age == 0) | failed.numpy()), self.rng)
-        self.seconds += time.time() - self.clock
-        updates, every = self.sac.updates, max(1, UPDATES // REPORTS)
-        reported = self.curve[-1]["updates"] if self.curve else 0
-        if updates and not all(math.isfinite(value) for value in self.losses.values()):
-            last = artifact_name("policy-checkpoint", EXPERIMENT, SEED)
-            stop(f"a loss is not finite after {updates} updates: {self.losses}; lower --learning_rate, or go "
-                 f"on from the last good {last} with --resume true", code=1)
-        if updates // every > reported // every or updates >= UPDATES:
-            self.report()
-            self.checkpoint()
-        self.clock = time.time()
+    def warm(self):
+        """Whether the warm-up is over. At its end the statistics of the state are fixed."""
+        if self.steps * ROBOTS < WARM_UP:
+            return False
+        if self.sac.updates == 0:
+            self.sac.normalise(self.replay[:self.steps * ROBOTS, :self.widths[0]])
+        return True
 
     def sample(self, n, recent=None):
         """n random steps, of the `recent` latest ones: s, a, s', displacement in metres, z."""
@@ -304,33 +270,56 @@ class Run:
         back = torch.randint(min(recent or filled, filled), (n,))
         return self.replay[(self.steps * ROBOTS - 1 - back) % len(self.replay)].split(self.widths, 1)
 
+    def learn(self, s, a, s2, c, c2, r):
+        """SAC updates from steps with their commands, one for each BATCH of them."""
+        self.sac.schedule(self.sac.updates / UPDATES)
+        x, x2 = self.sac.actor.inputs(s, c), self.sac.actor.inputs(s2, c2)
+        for batch in zip(*(part.split(BATCH) for part in (x, a, x2, r))):
+            loss = self.sac.update(*batch)
+        self.losses = dict(reward=r.mean().item(), loss=loss)
+
+    def collect(self):
+        """End the step: fill the replay buffer, start old robots anew, report and save a checkpoint."""
+        s, a, step = self.begun
+        displacement, failed = step.result()
+        rows = (self.steps * ROBOTS + torch.arange(ROBOTS)) % len(self.replay)
+        self.replay[rows] = torch.cat([s, a, self.robots.observe(), displacement, self.z], 1)
+        self.replay[rows[failed]] = self.replay[rows[failed] - ROBOTS]  # they mean nothing: repeat the last
+        self.steps += 1
+        self.age = (self.age + 1) % EPISODE
+        self.robots.reset(np.flatnonzero((self.age == 0) | failed), self.rng)
+        self.seconds += time.time() - self.clock
+        if not all(math.isfinite(value) for value in self.losses.values()):
+            stop(f"a loss is not finite after {self.sac.updates} updates: {self.losses}; lower "
+                 "--learning_rate; --resume true goes on from the last good checkpoint", code=1)
+        reported = self.curve[-1]["updates"] if self.curve else 0
+        if self.sac.updates >= min(UPDATES, reported + UPDATES / REPORTS):
+            self.report()
+        self.clock = time.time()
+
     def report(self):
-        """One line and one point of the learning curve."""
-        policy = as_policy(self.sac.average, self.decoder, self.names, {})
+        """One line, one point of the learning curve, and a checkpoint."""
+        policy = SimpleNamespace(actor=self.sac.average, decoder=self.decoder, names=self.names, relation={},
+                                 scale=STEP_SCALE, method=METHOD)
         row = dict(updates=self.sac.updates, env_steps=self.steps * ROBOTS, minutes=self.seconds / 60,
                    tracking_error=tracking(policy, False))
         if self.names:
             row["tracking_error_closed"] = tracking(policy, True)
-        row |= self.losses
-        self.curve.append(row)
+        self.curve.append(row | self.losses)
+        text = [f"{name} {round(value, 3)}" for name, value in self.curve[-1].items()]
         left = self.seconds / 60 * (UPDATES / self.sac.updates - 1)
-        text = [f"{name} {round(value, 3)}" for name, value in row.items()]
         speed = self.sac.updates / self.seconds
         print(*text, f"{speed:.0f} updates/s", f"{left:.1f} min left", sep="  ", flush=True)
-
-    def checkpoint(self):
-        save(OUT, "policy-checkpoint", EXPERIMENT, SEED, self.config, z=self.z,
-             robots=torch.from_numpy(self.robots.batch.state.copy()),
-             parts=[part.state_dict() for part in self.parts], curve=self.curve,
-             replay=self.replay[:self.steps * ROBOTS].clone(), age=torch.from_numpy(self.age),
-             numbers=[self.sac.updates, self.steps, self.seconds],
-             torch_rng=torch.get_rng_state(), numpy_rng=self.rng.bit_generator.state)
+        save(OUT, "policy-checkpoint", EXPERIMENT, SEED, self.fixed, z=self.z,
+             robots=torch.from_numpy(self.robots.batch.state.copy()), age=torch.from_numpy(self.age),
+             replay=self.replay[:self.steps * ROBOTS].clone(), curve=self.curve,
+             numbers=[self.sac.updates, self.steps, self.seconds], torch_rng=torch.get_rng_state(),
+             numpy_rng=self.rng.bit_generator.state, parts=[part.state_dict() for part in self.parts])
 
     def resume(self):
         if not (Path(OUT) / artifact_name("policy-checkpoint", EXPERIMENT, SEED)).exists():
             return print("there is no checkpoint yet: training from the beginning")
-        state = load(OUT, "policy-checkpoint", EXPERIMENT, SEED)
-        check_same(state, self.config, MAY_DIFFER)
+        state = load(OUT, "policy-checkpoint", EXPERIMENT, SEED, **self.fixed)
         for part, saved in zip(self.parts, state["parts"]):
             part.load_state_dict(saved)
         self.replay[:len(state["replay"])] = state["replay"]
@@ -341,62 +330,34 @@ class Run:
         self.rng.bit_generator.state = state["numpy_rng"]
 
 
-# ---------------------------------------------------------------- relation functions
-
-def calibrate_relation(decoder, names, steps):
-    """Alg. 1, "Test: find relation functions": for each factor of z_multi the weight with which single steps,
-    changed by the relation function (common.next_skill), come nearest to the decoder's free run of `steps`.
-    Returns {factor: weight} and prints how far the two are apart (RMS, as a share of the RMS step)."""
-    grid, relation = torch.linspace(-Z_RANGE, Z_RANGE, 13), {}
-    for factor in [name for name in names if name in MULTI]:
-        z = torch.zeros(len(grid) ** 2, len(names))  # direction 0: it stays within what 02 trains on
-        z[:, [names.index("speed"), names.index(factor)]] = torch.cartesian_prod(grid, grid)
-        free, errors = decoder(z, steps)[0], {}
-        for weight in np.linspace(-1, 1, 401).round(4).tolist():
-            chain = commands_of(as_policy(None, decoder, names, {factor: weight}), z, steps)
-            errors[weight] = ((chain - free).square().mean() / free.square().mean()).sqrt().item()
-        best = relation[factor] = min(errors, key=errors.get)
-        print(f"relation function of {factor}: weight {best:+.3f}, {errors[best]:.1%} from the decoder's "
-              f"free run ({errors[0.0]:.1%} without it)")
-    return relation
-
-
-def as_policy(actor, decoder, names, relation):
-    return SimpleNamespace(actor=actor, decoder=decoder, names=names, relation=relation, scale=STEP_SCALE,
-                           method=METHOD)
-
-
 # ---------------------------------------------------------------- main
 
 def main():
     config, _ = parse_flags(globals())
     torch.set_num_threads(1)
+    fixed = {name: value for name, value in config.items() if name not in MAY_DIFFER}
     source = load(OUT, "wetvae", DECODER, DECODER_SEED)
-    decoder, names = unpack(source["decoder"]), source["names"]
+    decoder, names = source["decoder"], source["names"]
     check_constants(decoder, names)
     torch.manual_seed(SEED)
-    if TRAIN and METHOD == "wedis":
-        relation = calibrate_relation(decoder, names, source["length"])  # Alg. 1, last; needs no policy
-        z_dim = sum(name in SINGLE for name in names)
-        run = Run(z_dim + decoder.x_dim, decoder.x_dim, decoder, names, config)
-        train_wedis(run, decoder)
-    elif TRAIN:
-        decoder, names, relation = Decoder(Z_DIM, 2, 64), [], {}  # no names mark a baseline everywhere
-        model = dict(decoder=decoder)
-        if METHOD == "sectar":
-            model["encoder"] = layers(2 * SKILL_STEPS, 64, 2 * Z_DIM)
-        run = Run(Z_DIM, Z_DIM if METHOD == "dads" else 2, decoder, names, config, model)
-        dict(dads=train_dads, sectar=train_sectar)[METHOD](run)
     if TRAIN:
-        save(OUT, "policy", EXPERIMENT, SEED, config, actor=pack(run.sac.average), decoder=pack(decoder),
-             method=METHOD, robot=ROBOT, names=names, relation=relation, scale=STEP_SCALE,
-             length=source["length"], curve=run.curve, updates=run.sac.updates,
-             env_steps=run.steps * ROBOTS, seconds=run.seconds)
-    policy = load_policy(OUT, EXPERIMENT, SEED)
-    check_same(vars(policy), config, MAY_DIFFER)
+        if METHOD == "wedis":
+            m1 = sum(name in SINGLE for name in names)
+            run = Run(decoder, names, m1 + decoder.x_dim, decoder.x_dim, fixed)
+            train_wedis(run)
+        else:
+            decoder, names = Decoder(Z_DIM, 2, 64), []  # no names mark a baseline everywhere
+            model = dict(decoder=decoder)
+            if METHOD == "sectar":
+                model["encoder"] = layers(2 * SKILL_STEPS, 64, 2 * Z_DIM)
+            run = Run(decoder, names, Z_DIM, Z_DIM if METHOD == "dads" else 2, fixed, model)
+            dict(dads=train_dads, sectar=train_sectar)[METHOD](run)
+        save(OUT, "policy", EXPERIMENT, SEED, config, actor=run.sac.average, decoder=decoder, method=METHOD,
+             robot=ROBOT, names=names, relation=source["relation"], scale=STEP_SCALE, length=source["length"],
+             curve=run.curve, updates=run.sac.updates, env_steps=run.steps * ROBOTS, seconds=run.seconds)
+    policy = SimpleNamespace(**load(OUT, "policy", EXPERIMENT, SEED, **fixed))
     measure(policy, source["ranges"])
     draw_skills(policy)
-    draw_robots()
 
 
 def check_constants(decoder, names):
@@ -407,7 +368,7 @@ def check_constants(decoder, names):
         stop(f"the {ROBOT} runs on a rail: --base_frame false; DADS and SeCTAR learn with --robot ant alone")
     if METHOD == "sectar" and Z_DIM < 3 or METHOD == "dads" and BASE_FRAME and Z_DIM != 2:
         stop("SeCTAR's --z_dim is at least 3; DADS needs --z_dim 2, or --base_frame false")
-    known = names[0] == "speed" and set(names) <= set(SINGLE + MULTI)
+    known = names[0] == "speed" and all(name in SINGLE or MULTI.get(name) in names for name in names)
     if not known or decoder.x_dim != make_robots(1, 1).places:
         stop(f"the decoder {DECODER} has axes {' '.join(names)} and predicts {decoder.x_dim} coordinates, "
              f"which does not fit the {ROBOT}: choose another --decoder or --robot")
@@ -416,8 +377,8 @@ def check_constants(decoder, names):
             stop(f"--{name.lower()} must be above 0")
     if DISCOUNT >= 1 or max(RELABELLED, CORRECTED, EXPLORE, AVERAGED, SMOOTHING, DECAY_FROM) > 1:
         stop("--discount is below 1; shares and rates are at most 1")
-    if EPISODE % SKILL_STEPS or not all(isinstance(n, int) and n > 0 for n in SINGLE_RUN + MULTI_RUN):
-        stop("--skill_steps must divide --episode; --single_run and --multi_run are whole and above 0")
+    if EPISODE % SKILL_STEPS or not all(isinstance(n, int) for n in SINGLE_RUN + MULTI_RUN):
+        stop("--skill_steps must divide --episode; --single_run and --multi_run are whole numbers")
 
 
 # ================================================================ Baselines: not needed to understand WEDIS
@@ -426,11 +387,10 @@ def train_dads(run):
     """Sharma et al. 2019: skills z ~ U(-1, 1)^2. The reward is the mutual information of step and z under the
     skill dynamics q(displacement | z), a Gaussian (theirs: a mixture of four), learnt at the same time.
     Rewards of old steps use the present q."""
-    q = run.decoder
 
     def log_q(displacement, z):
         """log q up to a constant: displacement (B, 2), own z (B, 2) -> (B,); (B, 1, 2), (L, 2) -> (B, L)."""
-        mean, log_var = (v[:, 0] for v in q(z, 1))
+        mean, log_var = (v[:, 0] for v in run.decoder(z, 1))
         variance = log_var.exp().clamp(min=(FLOOR_END / STEP_SCALE) ** 2)  # or likelihoods have no bound
         return -0.5 * (variance.log() + (displacement / STEP_SCALE - mean) ** 2 / variance).sum(-1)
 
@@ -452,15 +412,11 @@ def train_dads(run):
             loss.backward()
             run.adam.step()
 
-            run.sac.schedule(run.sac.updates / UPDATES)
             s, a, s2, displacement, z = run.sample(UPDATES_PER_STEP * BATCH)
             fresh = torch.rand(len(z), 1) < RELABELLED
             z = torch.where(fresh, torch.rand(z.shape) * 2 - 1, z)
-            r = REWARD_SCALE * information(displacement, z)
-            x, x2 = run.sac.actor.inputs(s, z), run.sac.actor.inputs(s2, z)
-            for batch in zip(*(v.split(BATCH) for v in (x, a, x2, r))):
-                run.sac.update(*batch)
-            run.losses = dict(reward=r.mean().item(), loss=loss.item())
+            run.learn(s, a, s2, z, z, REWARD_SCALE * information(displacement, z))
+            run.losses["loss"] = loss.item()
         run.collect()
 
 
@@ -482,12 +438,13 @@ def train_sectar(run):
         return -0.5 * (variance.log() + (x - decoded) ** 2 / variance).sum((1, 2)), kl, decoded
 
     def trajectories(n, recent):
-        """n random whole trajectories of the `recent` latest steps: rows (n, T) of the replay buffer."""
+        """n random whole trajectories of the `recent` latest steps: s, a, s', displacement, z (n, T, ..)."""
         block = ROBOTS * SKILL_STEPS
         done = run.steps // SKILL_STEPS
         back = torch.randint(max(1, min(done, len(run.replay) // block - 1, recent // block)), (n,))
         first = (done - 1 - back) % (len(run.replay) // block) * block + torch.randint(ROBOTS, (n,))
-        return first[:, None] + ROBOTS * torch.arange(SKILL_STEPS)
+        rows = first[:, None] + ROBOTS * torch.arange(SKILL_STEPS)
+        return run.replay[rows].split(run.widths, 2)
 
     def steps_of(z, decoded):
         """Commands (B, T, 2) of skills and explorers alike."""
@@ -503,7 +460,7 @@ def train_sectar(run):
             commands = steps_of(run.z, decoder(run.z, SKILL_STEPS)[0])
         run.act(commands[:, run.steps % SKILL_STEPS])
         if run.warm() and run.steps >= SKILL_STEPS:
-            _, _, _, x, z = run.replay[trajectories(MODEL_BATCH, RECENT)].split(run.widths, 2)
+            _, _, _, x, z = trajectories(MODEL_BATCH, RECENT)
             mine = (z[:, 0, -1] == EXPLORER) | (EXPLORE == 0)
             log_p, kl, _ = elbo(x / STEP_SCALE)
             loss = ((KL_WEIGHT * kl - log_p) * mine).sum() / mine.sum().clamp(min=1)
@@ -511,41 +468,44 @@ def train_sectar(run):
             loss.backward()
             run.adam.step()
 
-            run.sac.schedule(run.sac.updates / UPDATES)
-            rows = trajectories(max(1, UPDATES_PER_STEP * BATCH // SKILL_STEPS), len(run.replay))
-            s, a, s2, x, z = run.replay[rows].split(run.widths, 2)
+            n = max(1, UPDATES_PER_STEP * BATCH // SKILL_STEPS)
+            s, a, s2, x, z = trajectories(n, len(run.replay))
             x, z = x / STEP_SCALE, z[:, 0]
             explorer = z[:, -1] == EXPLORER
-            fresh = (torch.rand(len(z)) < RELABELLED) & ~explorer
+            fresh = (torch.rand(n) < RELABELLED) & ~explorer
             z[fresh] = torch.randn(int(fresh.sum()), Z_DIM)
             with torch.no_grad():
                 decoded = torch.where(explorer[:, None, None], elbo(x)[2], decoder(z, SKILL_STEPS)[0])
-                # Laplace likelihood of the place where a trajectory ends, shared among its steps. The trap:
-                # the likelihood of single steps is highest for a robot that stands still
-                error = x - decoded
-                direction = torch.where(explorer[:, None], z[:, :2], -error.sum(1))
-                r = REWARD_SCALE * (error * nn.functional.normalize(direction)[:, None]).sum(2)
-                c = steps_of(z, decoded)
-                c2 = torch.cat([c[:, 1:], c[:, -1:]], 1)
-                s, a, s2, r, c, c2 = (v.flatten(0, 1) for v in (s, a, s2, r, c, c2))
-                x, x2 = run.sac.actor.inputs(s, c), run.sac.actor.inputs(s2, c2)
-            order = torch.randperm(len(x))
-            for batch in zip(*(v[order].split(BATCH) for v in (x, a, x2, r))):
-                run.sac.update(*batch)
-            run.losses = dict(reward=r.mean().item(), loss=loss.item())
+            # Laplace likelihood of the place where a trajectory ends, shared among its steps. The trap:
+            # the likelihood of single steps is highest for a robot that stands still
+            error = x - decoded
+            direction = torch.where(explorer[:, None], z[:, :2], -error.sum(1))
+            r = REWARD_SCALE * (error * nn.functional.normalize(direction)[:, None]).sum(2)
+            c = steps_of(z, decoded)
+            c2 = torch.cat([c[:, 1:], c[:, -1:]], 1)
+            order = torch.randperm(r.numel())
+            run.learn(*(part.flatten(0, 1)[order] for part in (s, a, s2, c, c2, r)))
+            run.losses["loss"] = loss.item()
         run.collect()
 
 
 # ================================================================ Measuring and drawing: not needed for WEDIS
 
 def make_robots(n, threads):
-    return Robots(robot_spec(ROBOT), n, threads)
+    return Robots(mujoco.MjSpec.from_file(str(HERE / f"{ROBOT}.xml")), n, threads)
+
+
+def upside_down(robots):
+    """Which robots have turned over (n,): the torso's z axis points down."""
+    if robots.places == 1:
+        return np.cos(robots.qpos[:, 2]) < 0
+    return (robots.qpos[:, 4:6] ** 2).sum(1) > 0.5  # of its quaternion: 1 - 2 (x^2 + y^2) < 0
 
 
 def traversal(policy, axis, values):
-    """Skills with one axis at values, the others at 0 (with acceleration on a rail: z_speed at -1)."""
+    """Skills with one axis at values, the others at 0 (on a rail the speed at -1: 0 cannot accelerate)."""
     z = torch.zeros(len(values), len(policy.names) or Z_DIM)
-    if policy.names == ["speed", "acceleration"] and axis == 1:
+    if policy.decoder.x_dim == 1:
         z[:, 0] = -1
     z[:, axis] = torch.as_tensor(values, dtype=torch.float32)
     return z
@@ -556,9 +516,8 @@ def grid(policy):
     SeCTAR 25 fixed draws from the prior."""
     if METHOD == "sectar":
         return torch.randn(25, Z_DIM, generator=torch.Generator().manual_seed(0))
-    if policy.decoder.x_dim == 1:
-        z = torch.linspace(-Z_RANGE, Z_RANGE, 8)[:, None]
-    else:
+    z = torch.linspace(-Z_RANGE, Z_RANGE, 8)[:, None]
+    if policy.decoder.x_dim == 2:
         circle = policy.decoder.circle is not None  # its two ends are one direction
         directions = torch.linspace(-Z_RANGE, Z_RANGE, DIRECTIONS + circle)[:DIRECTIONS]
         z = torch.cartesian_prod(torch.linspace(-Z_RANGE, Z_RANGE, 5), directions)
@@ -609,14 +568,14 @@ def following(policy, closed):
         commands = commands_of(policy, z, MULTI_RUN[0])
         predicted = robots.place() + MULTI_RUN[1] * policy.scale * commands.sum(1)
         for _ in execute(policy, robots, commands, MULTI_RUN[1], closed, True):
-            fallen |= robots.upside_down()
+            fallen |= upside_down(robots)
         away.append((robots.place() - predicted).norm(dim=1).numpy())
     return dict(follow_median_m=float(np.median(away)), follow_p90_m=float(np.quantile(away, 0.9)),
                 fall_rate=float(fallen.mean()))
 
 
 def executed_cross_talk(policy, ranges, closed):
-    """Cross-talk C (axes, factors) of executed skills, from steps of a fifth of a skill, a mean of starts."""
+    """cross_talk of executed skills, from steps of a fifth of a skill, a mean of noisy starts."""
     values, curves = np.linspace(-Z_RANGE, Z_RANGE, TRAVERSAL), []
     every = max(1, MULTI_RUN[0] * MULTI_RUN[1] // 5)
     for axis in range(len(policy.names)):
@@ -632,14 +591,13 @@ def measure(policy, ranges):
     loop, with _open as in the paper."""
     row = dict(experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy.updates,
                env_steps=policy.env_steps, threads=policy.config["THREADS"],
-               train_minutes=policy.seconds / 60,
-               tracking_error=tracking(policy, False))
+               train_minutes=policy.seconds / 60, tracking_error=tracking(policy, False))
     if METHOD == "wedis":
         row["tracking_error_closed"] = tracking(policy, True)
         for closed, end in ((False, "_open"), (True, "")):
             row |= {name + end: value for name, value in following(policy, closed).items()}
-            C = executed_cross_talk(policy, ranges, closed)
-            row |= {f"purity_{name}{end}": purity(C, i, i) for i, name in enumerate(policy.names)}
+            _, purity = executed_cross_talk(policy, ranges, closed)
+            row |= {f"purity_{name}{end}": value for name, value in zip(policy.names, purity.tolist())}
     for name, value in row.items():
         print(f"{name:24} {value if isinstance(value, str) else round(value, 3)}")
     update_csv(Path(OUT) / "results" / "policies.csv", [row], ("experiment", "seed"))
@@ -651,7 +609,7 @@ def draw_skills(policy):
     names = policy.names or [str(i + 1) for i in range(Z_DIM)]
     rows = ("predicted", "executed, open loop", "executed, closed loop")[:2 + bool(policy.names)]
     rail = policy.decoder.x_dim == 1
-    figure, axes = plt.subplots(len(rows), len(names), squeeze=False,
+    figure, axes = plt.subplots(len(rows), len(names), squeeze=False, sharex="col", sharey="col",
                                 figsize=(2.8 * len(names) + 1, 2.8 * len(rows)))
     for i, name in enumerate(names):
         run = MULTI_RUN if rail or name in MULTI else SINGLE_RUN
@@ -663,18 +621,13 @@ def draw_skills(policy):
         z = traversal(policy, i, values)
         paths = [predicted_path(policy, z, run)]
         paths += [roll_out(policy, z, run, closed) for closed in (False, True)[:len(rows) - 1]]
-        places = np.concatenate([path.reshape(-1, path.shape[2]) for path in paths])
-        low, high = places.min(0), places.max(0)
-        reach = 0.6 * (high - low).max() + 0.01  # one scale for all rows of a column
-        limits = [(middle - reach, middle + reach) for middle in (low + high) / 2]
         for ax, path in zip(axes[:, i], paths):
-            ax.set_xlim(limits[0])
             marks = path[:, ::1 if path is paths[0] else run[1]]
             if rail:
                 for t, colour in enumerate(plt.get_cmap("plasma")(np.linspace(0, 0.85, marks.shape[1]))):
                     ax.plot(marks[:, t, 0], values, ".", color=colour, label=f"t = {t}")
                 continue
-            ax.set(ylim=limits[1], aspect="equal")
+            ax.set_aspect("equal")
             for line, dots, value, colour in zip(path, marks, values, colours):
                 ax.plot(*line.T, color=colour, lw=1.3, label=f"{value:g}")
                 ax.plot(*dots.T, "o", ms=3 if len(dots) < 10 else 0, color=colour)
@@ -685,28 +638,6 @@ def draw_skills(policy):
     handles = axes[0, 0].get_legend_handles_labels()
     figure.legend(*handles, title="transition" if rail else "latent", loc="outside right upper")
     save_figure(figure, OUT, FIGURE or f"skills_{EXPERIMENT}")
-
-
-def draw_robots():
-    """Fig 14: both robots, rendered by MuJoCo off-screen."""
-    figure, axes = plt.subplots(1, 2, figsize=(8, 3.2))
-    for ax, name in zip(axes, ("ant", "half_cheetah")):
-        model = robot_spec(name).compile()
-        model.stat.extent = 2.2  # metres, what the default camera shows
-        model.vis.map.shadowclip = 2  # or the floor is speckled
-        data = mujoco.MjData(model)
-        mujoco.mj_resetDataKeyframe(model, data, 0)
-        mujoco.mj_forward(model, data)
-        try:
-            renderer = mujoco.Renderer(model, 400, 500)
-        except Exception:  # no GL library, no device: the kinds differ by platform
-            print("no Fig 14: MuJoCo's renderer needs a GL library, such as libegl1 (Debian, Ubuntu)")
-            return plt.close(figure)
-        renderer.update_scene(data)
-        ax.imshow(renderer.render())
-        ax.set(title=name, xticks=[], yticks=[])
-        ax.grid(False)
-    save_figure(figure, OUT, "fig14_robots")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,5 @@
-"""What two or more stages share, in the order in which a reader meets it:
-command line, artifacts and CSV, weak labels and factors, decoder, robot, actor, execution, plots.
-
-Units: trajectory units for decoder displacements (a fast transition is 1), metres and radians in the world,
-`scale` metres per trajectory unit and environment step, 0.05 s per environment step.
+"""What two or more stages share. Units: trajectory units for decoder displacements (a fast transition is 1),
+metres and radians in the world, `scale` metres per trajectory unit and environment step of 0.05 s.
 """
 import argparse
 import contextlib
@@ -17,7 +14,6 @@ import re
 import signal
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 os.environ["MPLBACKEND"] = "Agg"  # figures are files; a notebook's backend would fail here
 if sys.platform == "linux":  # before mujoco loads: GLFW aborts without a screen
@@ -31,8 +27,16 @@ from mujoco.batch import Batch
 from torch import nn
 from torch.utils._pytree import tree_leaves
 
+SINGLE = ("speed", "direction")  # factors of z_single, Sec. 4.2.2: they act in each transition
+MULTI = dict(curvature="direction", acceleration="speed")  # factors of z_multi, and what they change in time
+CLASSES = dict(speed=4, direction=4, curvature=3, acceleration=3, x=4, y=4)  # of labels, App. A.1.1, A.3.1
+FRAME_SKIP = 5     # physics steps of 0.01 s per environment step
+FEEDBACK = 0.1     # closed loop: share of the distance to the reference added to a command (the paper: 0)
+CORRECTION = 0.2   # at most so much, trajectory units
+FASTEST = 1.0      # no command is longer, trajectory units: much longer ones than in training make falls
+SOFT_START = 20    # environment steps over which the longest command grows from 0.2 to FASTEST
+FORMAT = 3         # of the artifacts; raise it when the meaning of what is stored changes
 HERE = Path(__file__).parent
-FORMAT = 3  # of the artifacts; raise it when the meaning of what is stored changes
 SCRIPT = {"dataset": "01_make_dataset.py", "wetvae": "02_train_wetvae.py", "policy": "03_train_policy.py"}
 
 
@@ -45,8 +49,8 @@ def stop(message, code=2):
 
 
 def convert(value, like, name, least=0):
-    """value (a flag's text, or what a file says) -> the type of `like`. Exits with 2 if it does not fit.
-    Whole numbers are at least 1, but seeds and ports 0; others at least `least`."""
+    """value (a flag's text, or what a row says) -> the type of `like`. Exits with 2 if it does not fit: whole
+    numbers are at least 1 (seeds and ports 0), others at least `least`."""
     kind, text = type(like), str(value).lower()
     if kind is str:
         return str(value)
@@ -56,47 +60,45 @@ def convert(value, like, name, least=0):
         parts = value if isinstance(value, tuple) else text.split()
         if len(parts) == len(like):
             return tuple(convert(part, one, name, -1e9) for part, one in zip(parts, like))
-    if kind is int and least == 0 and not name.lower().endswith(("seed", "seeds", "port")):
-        least = 1
+    if kind is int:
+        least = 0 if name.lower().endswith(("seed", "seeds", "port")) else 1
     with contextlib.suppress(ValueError):
         number = float(text)
         if kind in (int, float) and least <= number < math.inf and number == kind(number):
             return kind(number)
-    kinds = {bool: "true or false", int: f"a whole number of at least {least}",
+    kinds = {bool: "true or false", int: f"a whole number of at least {least} (a share of nothing: 0.0)",
              float: f"a number of at least {least:g}", tuple: f"{np.size(like)} numbers"}
-    hint = "; a share or weight of nothing is 0.0" if text == "0" else ""
-    stop(f"{name} is {value!r}, but must be {kinds[kind]}{hint}")
+    stop(f"{name} is {value!r}, but must be {kinds[kind]}")
 
 
 def parse_flags(stage, argv=None):
     """Make each `NAME = value # comment` at the top of a stage (its globals()) a flag --name, and set it. A
     row of EXPERIMENTS overrides it, a flag both. Returns {NAME: value}, and the flags' alone."""
-    hint = "; --resume true goes on from the last checkpoint" if "RESUME" in stage else ""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop("stopped" + hint, 1))
+        signal.signal(number, lambda *_: stop("stopped; 02 and 03 go on with --resume true", 1))
     if hasattr(signal, "SIGPIPE"):
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # piped into head: end as other programs do
     parser = argparse.ArgumentParser(description=stage["__doc__"], allow_abbrev=False,
                                      argument_default=argparse.SUPPRESS,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.error = lambda message: stop(f"{message}; see --help")
-    values, source = {}, Path(stage["__file__"]).read_text(encoding="utf-8")
+    likes, source = {}, Path(stage["__file__"]).read_text(encoding="utf-8")
     for name, text, comment in re.findall(r"^([A-Z_]+) = (.*?)(?:  +# (.*))?$", source, re.MULTILINE):
-        if isinstance(stage[name], (bool, int, float, str, tuple)):
-            values[name] = stage[name]
-            if isinstance(stage[name], float) and stage[name].is_integer() and "." not in text:
-                values[name] = int(stage[name])  # 1e4, 512 / 2
-            parser.add_argument("--" + name.lower(), dest=name, metavar=type(values[name]).__name__,
-                                help=f"{comment} [{values[name]}]".replace("%", "%%"))
+        like = stage[name]
+        if isinstance(like, float) and like.is_integer() and "." not in text:
+            like = int(like)  # 1e4, 512 / 2
+        if isinstance(like, (bool, int, float, str, tuple)):
+            likes[name] = like
+            parser.add_argument("--" + name.lower(), dest=name, metavar=type(like).__name__,
+                                help=f"{comment} [{like}]".replace("%", "%%"))
     given = vars(parser.parse_args(argv))
     experiment, rows = given.get("EXPERIMENT", stage["EXPERIMENT"]), stage["EXPERIMENTS"]
     if experiment not in rows:
         stop(f"unknown experiment {experiment!r}; allowed: {' '.join(rows)}")
-    for name in rows[experiment]:
-        if name not in stage:
-            stop(f"{name} in the row {experiment!r} of EXPERIMENTS is no constant of this file")
+    if unknown := set(rows[experiment]) - set(stage):
+        stop(f"{' '.join(unknown)} in the row {experiment!r} of EXPERIMENTS is no constant of this file")
     stage.update(rows[experiment] | given)
-    config = {name: convert(stage[name], like, "--" + name.lower()) for name, like in values.items()}
+    config = {name: convert(stage[name], like, "--" + name.lower()) for name, like in likes.items()}
     stage.update(config)
     write_whole(Path(stage["OUT"]) / f".can_write_{os.getpid()}", b"").unlink()  # before any work is lost
     return config, {name: config[name] for name in given}
@@ -127,22 +129,25 @@ def artifact_name(kind, experiment, seed):
 
 
 def save(out, kind, experiment, seed, config, **content):
-    """Write an artifact: arrays, or tensors and plain values, then the 32 bytes of their SHA-256."""
+    """Write an artifact, then the 32 bytes of its SHA-256. content: arrays (dataset), or tensors, plain
+    values and networks. Returns its path."""
     meta = dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed, config=config,
                 versions=dict(torch=str(torch.__version__), mujoco=mujoco.__version__, numpy=np.__version__))
     buffer = io.BytesIO()
     if kind == "dataset":
         np.savez(buffer, meta=json.dumps(meta), **content)
     else:
+        networks = {name: part for name, part in content.items() if isinstance(part, nn.Module)}
+        for name, net in networks.items():  # as plain values: reading a file must not run code
+            content[name] = dict(network=type(net).__name__, arguments=net.arguments, state=net.state_dict())
         torch.save(meta | content, buffer)
-    data = buffer.getvalue()
-    path = Path(out) / artifact_name(kind, experiment, seed)
+    data, path = buffer.getvalue(), Path(out) / artifact_name(kind, experiment, seed)
     return write_whole(path, data + hashlib.sha256(data).digest())
 
 
-def load(out, kind, experiment, seed):
-    """Read an artifact from <out>/, else pretrained/, and say which. Returns its content and "sha256" (hex
-    digits). Exits with 2 and one line if it is missing, damaged, foreign or not finite."""
+def load(out, kind, experiment, seed, **same):
+    """Read an artifact from <out>/, else pretrained/, and say which. Returns its content and "sha256". Exits
+    with 2 if it is missing, damaged, foreign, not finite, or made with other constants than those of same."""
     name = artifact_name(kind, experiment, seed)
     row = experiment.removesuffix("_none").removesuffix("_circle")  # 02 makes these in one row
     make = f"make it with: python {SCRIPT[kind.partition('-')[0]]} --experiment {row} --seed {seed}"
@@ -153,28 +158,24 @@ def load(out, kind, experiment, seed):
     if hashlib.sha256(data[:-32]).digest() != data[-32:]:
         stop(f"{path} is damaged or is no artifact of this project; {make}")
     if kind == "dataset":
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            content = {key: file[key] for key in file.files}
+        content = dict(np.load(io.BytesIO(data), allow_pickle=False))
         content |= json.loads(str(content.pop("meta")))
     else:
         content = torch.load(io.BytesIO(data[:-32]), weights_only=True)
-    for key, needed in dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed).items():
-        if content[key] != needed:
-            stop(f"{path} has {key} {content[key]!r} where {needed!r} is needed; {make}")
+    made = content["config"] | content
+    for key, value in (dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed) | same).items():
+        if made.get(key) != value:
+            stop(f"{path} has {key} = {made.get(key)}, not {value}: give the same, or {make}")
     numbers = [np.asarray(leaf) for leaf in tree_leaves(content) if not isinstance(leaf, str)]
     if not all(np.isfinite(leaf).all() for leaf in numbers if leaf.dtype.kind == "f"):
         stop(f"{path} holds numbers that are not finite; {make}")
+    for name, part in content.items():
+        if isinstance(part, dict) and "network" in part:
+            network = dict(Decoder=Decoder, Actor=Actor)[part["network"]](*part["arguments"])
+            network.load_state_dict(part["state"])
+            content[name] = network.requires_grad_(False)
     print(f"using {path.relative_to(HERE) if path.is_relative_to(HERE) else path}")
     return content | dict(sha256=data[-32:].hex())
-
-
-def check_same(artifact, config, free):
-    """Exit with 2 unless an artifact has today's value of each constant that is not named in free."""
-    made = artifact["config"]
-    for name in sorted(set(config) - set(free)):
-        if made.get(name) != config[name]:
-            stop(f"{artifact['kind']} {artifact['experiment']} was made with {name} = {made.get(name)}, not "
-                 f"{config[name]}: give the same, or train anew")
 
 
 def update_csv(path, rows, key):
@@ -187,26 +188,20 @@ def update_csv(path, rows, key):
             import fcntl
             fcntl.flock(lock, fcntl.LOCK_EX)
         old = read_csv(path) if path.exists() else []
-        kept = [row for row in old if tuple(row.get(k) for k in key) not in replaced]
+        rows = [row for row in old if tuple(row.get(k) for k in key) not in replaced] + new
         text = io.StringIO()
-        columns = list(dict.fromkeys(name for row in kept + new for name in row))
+        columns = dict.fromkeys(name for row in rows for name in row)
         writer = csv.DictWriter(text, columns, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(kept + new)
+        writer.writerows(rows)
         write_whole(path, text.getvalue().encode())
 
 
 def read_csv(path):
-    with open(path, newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
 
 
 # ---------------------------------------------------------------- weak labels and factors
-
-SINGLE = ("speed", "direction")          # factors of z_single, Sec. 4.2.2: they act in each transition
-MULTI = ("curvature", "acceleration")    # factors of z_multi: they act over several transitions
-CLASSES = dict(speed=4, direction=4, curvature=3, acceleration=3, x=4, y=4)  # of labels, App. A.1.1, A.3.1
-
 
 def weak_labels(factors, names, ranges):
     """Weak labels, App. A.1.1, A.3.1, Fig 9: factors {name: (N,)}, ranges {name: (low, high)} -> (N, M) int64
@@ -214,12 +209,11 @@ def weak_labels(factors, names, ranges):
     labels = []
     for name in names:
         if name in MULTI:
-            label = np.select([factors[name] > 0, factors[name] < 0], [1, 2], 0)
+            labels.append(np.sign(factors[name]).astype(int) % 3)
         else:
-            label = np.digitize(factors[name], np.linspace(*ranges[name], CLASSES[name] + 1)[1:-1])
+            labels.append(np.digitize(factors[name], np.linspace(*ranges[name], CLASSES[name] + 1)[1:-1]))
         if name == "direction":  # from the left downwards
-            label = CLASSES[name] - 1 - label
-        labels.append(label)
+            labels[-1] = CLASSES[name] - 1 - labels[-1]
     return np.stack(labels, 1)
 
 
@@ -227,17 +221,16 @@ def factors_of(displacement, names):
     """The factors in names of trajectories: displacement (N, T, 2 or 1) -> {name: (N,)}. Speed: the mean
     (with acceleration: the first), on a rail with a sign; direction: the first, radians; curvature: radians
     per transition; x, y: the mean; acceleration: per transition, as a share of the speed."""
-    steps = displacement.shape[1]
+    turns = max(displacement.shape[1] - 1, 1)
     size = np.linalg.norm(displacement, axis=2) if displacement.shape[2] == 2 else displacement[..., 0]
     found = dict(speed=size.mean(1))
     if "acceleration" in names:
         found["speed"] = size[:, 0]
-        gain = (size[:, -1] - size[:, 0]) / max(steps - 1, 1) * np.sign(size[:, 0])
+        gain = (size[:, -1] - size[:, 0]) / turns * np.sign(size[:, 0])
         found["acceleration"] = gain / np.maximum(abs(size[:, 0]), 0.1)
     if displacement.shape[2] == 2:
-        heading = np.arctan2(displacement[..., 1], displacement[..., 0])
-        turn = (np.diff(heading, axis=1) + math.pi) % (2 * math.pi) - math.pi
-        found["direction"], found["curvature"] = heading[:, 0], turn.sum(1) / max(steps - 1, 1)
+        heading = np.unwrap(np.arctan2(displacement[..., 1], displacement[..., 0]))
+        found["direction"], found["curvature"] = heading[:, 0], (heading[:, -1] - heading[:, 0]) / turns
         found["x"], found["y"] = displacement.mean(1).T
     return {name: found[name] for name in names}
 
@@ -251,18 +244,15 @@ def spread(values, name):
 
 
 def cross_talk(curves, ranges):
-    """Cross-talk C (axes, factors): range of factor j along axis i / its range in the data. curves: for each
-    axis the factors {name: (n,)} along its traversal; ranges: {name: (low, high)}."""
-    return np.array([[spread(curve[name], name) / np.ptp(limits) for name, limits in ranges.items()]
-                     for curve in curves])
+    """Cross-talk C (axes, factors): range of factor j along axis i / its range in the data, and the purity of
+    each axis, C[i, i] / sum_j C[i, j], or nan if it is dead, its whole row below 0.1. curves: for each axis
+    the factors {name: (n,)} along its traversal; ranges: {name: (low, high)}."""
+    C = np.array([[spread(curve[name], name) / np.ptp(limits) for name, limits in ranges.items()]
+                  for curve in curves])
+    return C, np.where(C.max(1) < 0.1, math.nan, C.diagonal() / C.sum(1).clip(1e-9))
 
 
-def purity(C, i, j):
-    """Purity of axis i for factor j: C[i, j] / sum_k C[i, k]. A row below 0.1 is a dead axis: nan."""
-    return C[i, j] / C[i].sum() if C[i].max() >= 0.1 else math.nan
-
-
-# ---------------------------------------------------------------- the decoder: predictive model and reward
+# ---------------------------------------------------------------- decoder, robot, actor, execution
 
 def layers(n_in, hidden, n_out):
     """Two hidden layers with ReLU."""
@@ -284,37 +274,25 @@ class Decoder(nn.Module):
         self.register_buffer("axes", torch.eye(z_dim))  # canonical z -> latents: a signed permutation
 
     def forward(self, z, steps):
-        """Canonical z (B, M): axis m is factor m, + is more of it -> as unroll."""
-        return self.unroll(z @ self.axes, steps)
+        """Canonical z (B, M): axis m is factor m, + is more of it; z_single is (z_single, 0) -> as unroll."""
+        return self.unroll(z @ self.axes[:z.shape[1]], steps)
 
     def unroll(self, z, steps):
         """Latents z of training (B, M) -> mean and log-variance of displacements, (B, steps, x_dim) each."""
         i = self.circle
         if i is not None:
             z = torch.cat([z[:, :i], on_circle(z[:, i]), z[:, i + 1:]], 1)
-        mean, state, means, log_vars = z.new_zeros(len(z), self.x_dim), None, [], []
+        mean, state, out = z.new_zeros(len(z), self.x_dim), None, []
         for _ in range(steps):
             state = self.cell(torch.cat([mean, z], 1), state)
-            mean, log_var = self.head(state[0]).chunk(2, 1)
-            means.append(mean)
-            log_vars.append(log_var)
-        return torch.stack(means, 1), torch.stack(log_vars, 1)
+            out.append(self.head(state[0]))
+            mean = out[-1][:, :self.x_dim]
+        return torch.stack(out, 1).chunk(2, 2)
 
 
 def on_circle(z):
     """Angle latents (B,), of which 3 is a whole turn -> cosine and sine (B, 2)."""
     return torch.stack([(z * 2 * math.pi / 3).cos(), (z * 2 * math.pi / 3).sin()], 1)
-
-
-def pack(module):
-    """A network as plain values and tensors, for an artifact; unpack makes it again."""
-    return dict(network=type(module).__name__, arguments=list(module.arguments), state=module.state_dict())
-
-
-def unpack(packed):
-    module = dict(Decoder=Decoder, Actor=Actor)[packed["network"]](*packed["arguments"])
-    module.load_state_dict(packed["state"])
-    return module.requires_grad_(False)
 
 
 def next_skill(z, names, relation):
@@ -323,24 +301,17 @@ def next_skill(z, names, relation):
     z = z.clone()
     for factor, weight in relation.items():
         change = weight * z[..., names.index(factor)]
-        target = z[..., names.index("direction" if factor == "curvature" else "speed")]  # a view
+        target = z[..., names.index(MULTI[factor])]  # a view
         if factor == "acceleration" and "direction" not in names:
             change = change * target.sign()  # f_speed of App. A.3.2: on a rail a speed has a sign
         target += change  # f_dir or f_speed
     return z
 
 
-def first_step(decoder, z_single):
-    """p_theta(s_1 | z) for z = (z_single, 0), Sec. 6.1.2: mean and log-variance (B, x_dim)."""
-    z = nn.functional.pad(z_single, (0, len(decoder.axes) - z_single.shape[1]))
-    mean, log_var = decoder(z, 1)
-    return mean[:, 0], log_var[:, 0]
-
-
 @torch.no_grad()
 def commands_of(policy, z, steps):
     """The commands of skills z (B, M): (B, `steps`, c_dim) in trajectory units. WEDIS: first steps of the
-    decoder, with relation functions in between; SeCTAR: its decoder's steps; DADS: z itself."""
+    decoder for z_single, with relation functions in between; SeCTAR: its decoder's steps; DADS: z itself."""
     if policy.method == "dads":
         return z[:, None].expand(-1, steps, -1)
     if not policy.names:
@@ -349,23 +320,13 @@ def commands_of(policy, z, steps):
     for _ in range(steps):
         singles.append(z[:, :sum(name in SINGLE for name in policy.names)])
         z = next_skill(z, policy.names, policy.relation)
-    mean, _ = first_step(policy.decoder, torch.cat(singles))
+    mean, _ = policy.decoder(torch.cat(singles), 1)
     return mean.view(steps, len(z), -1).transpose(0, 1)
 
 
-# ---------------------------------------------------------------- the robot
-
-FRAME_SKIP = 5  # physics steps of 0.01 s per environment step
-
-
-def robot_spec(name):
-    """ant (nq 15, nv 14, nu 8) or half_cheetah (9, 9, 6) of the MuJoCo benchmarks. 04 adds walls to it."""
-    return mujoco.MjSpec.from_file(str(HERE / f"{name}.xml"))
-
-
 class Robots:
-    """n robots of one model that step together on threads; equal to a loop over mj_step (mujoco.batch). In
-    the plane a robot has the places x and y, on a rail x alone."""
+    """n robots of one model (ant.xml: nq 15, nv 14, nu 8; half_cheetah.xml: 9, 9, 6) that step together on
+    threads; equal to a loop over mj_step. In the plane a robot has the places x and y, on a rail x alone."""
 
     def __init__(self, spec, n, threads=2):
         model = spec.compile()
@@ -383,21 +344,11 @@ class Robots:
 
     def place(self):
         """Places (n, 2 or 1) in metres. Float32."""
-        return torch.from_numpy(self.qpos[:, :self.places].astype(np.float32))
-
-    def age(self):
-        """Environment steps since the last reset (n, 1). Float32."""
-        return torch.from_numpy(self.time[:, None].astype(np.float32)) / 0.05
+        return torch.from_numpy(self.qpos[:, :self.places]).float()
 
     def observe(self):
         """The policy's state, App. A.1.3: qpos without the place, qvel. (n, 27), Half-Cheetah (n, 17)."""
-        return torch.from_numpy(np.concatenate([self.qpos[:, self.places:], self.qvel], 1).astype(np.float32))
-
-    def upside_down(self):
-        """Which robots have turned over (n,): the torso's z axis points down."""
-        if self.places == 1:
-            return np.cos(self.qpos[:, 2]) < 0
-        return (self.qpos[:, 4:6] ** 2).sum(1) > 0.5  # of its quaternion: 1 - 2 (x^2 + y^2) < 0
+        return torch.from_numpy(np.concatenate([self.qpos[:, self.places:], self.qvel], 1)).float()
 
     def step(self, action):
         """One environment step of 0.05 s. action (n, nu) in [-1, 1]. Returns displacement (n, 2 or 1) in
@@ -406,10 +357,8 @@ class Robots:
         self.ctrl[:] = action
         self.batch.step(nstep=FRAME_SKIP)
         unstable = self.batch.warning.any((1, 2))
-        return torch.from_numpy((self.qpos[:, :self.places] - before).astype(np.float32)), unstable
+        return torch.from_numpy(self.qpos[:, :self.places] - before).float(), unstable
 
-
-# ---------------------------------------------------------------- the skill policy
 
 def rotate(v, angle):
     """Vectors (B, 2) turned counter-clockwise by angle (B,)."""
@@ -463,19 +412,13 @@ class Actor(nn.Module):
         return self(self.inputs(s, c), deterministic)[0]
 
 
-FEEDBACK = 0.1     # closed loop: share of the distance to the reference that each command adds, a slow one up
-                   # to twice as much (the paper: 0)
-CORRECTION = 0.2   # at most so much, trajectory units
-FASTEST = 1.0      # no command is longer, trajectory units: much longer ones than in training make falls
-SOFT_START = 20    # environment steps over which the longest command grows from 0.2 to FASTEST
-
-
 def closed_loop(c, reference, robots, scale):
     """Commands (n, 2 or 1), trajectory units: c and a share of reference - place, both in metres."""
-    share = FEEDBACK * (2 - c.norm(dim=1, keepdim=True).clamp(max=1))
+    share = FEEDBACK * (2 - c.norm(dim=1, keepdim=True).clamp(max=1))  # slow commands: up to twice as much
     correction = share * (reference - robots.place()) / scale
     c = c + correction * (CORRECTION / correction.norm(dim=1, keepdim=True).clamp(min=CORRECTION))
-    longest = (0.2 + (FASTEST - 0.2) * robots.age() / SOFT_START).clamp(max=FASTEST)
+    steps = torch.from_numpy(robots.time).float()[:, None] / 0.05  # since the last reset
+    longest = (0.2 + (FASTEST - 0.2) * steps / SOFT_START).clamp(max=FASTEST)
     return c * (longest / torch.maximum(c.norm(dim=1, keepdim=True), longest))
 
 
@@ -489,14 +432,6 @@ def execute(policy, robots, commands, hold, closed, deterministic):
             yield robots.step(policy.actor.act(robots.observe(), asked, deterministic).numpy())
             if closed:
                 reference = reference + policy.scale * c
-
-
-def load_policy(out, experiment, seed):
-    """A policy artifact of 03 as a namespace: networks actor and decoder, method, robot, names of the axes
-    ([] for DADS, SeCTAR), relation (weights), scale (metres per trajectory unit), and what else it holds."""
-    content = load(out, "policy", experiment, seed)
-    networks = {name: unpack(content[name]) for name in ("actor", "decoder")}
-    return SimpleNamespace(**content | networks)
 
 
 # ---------------------------------------------------------------- plots

@@ -13,8 +13,9 @@ import sys
 import tempfile
 import time
 import warnings
+from types import SimpleNamespace
 
-from conftest import ROOT, script  # first: it makes common known
+from conftest import ROOT, robot_spec, script  # first: it makes common known
 import common
 import gymnasium
 import mujoco
@@ -61,7 +62,7 @@ def sb3_updates():
 
 
 def our_robots(threads):
-    robots, action = common.Robots(common.robot_spec("ant"), 64, threads), np.random.uniform(-1, 1, (64, 8))
+    robots, action = common.Robots(robot_spec("ant"), 64, threads), np.random.uniform(-1, 1, (64, 8))
 
     def step():
         robots.observe()
@@ -70,7 +71,7 @@ def our_robots(threads):
 
 
 def bare_mj_step():
-    model = common.robot_spec("ant").compile()
+    model = robot_spec("ant").compile()
     data = mujoco.MjData(model)
     action = np.random.uniform(-1, 1, 8)
 
@@ -92,7 +93,7 @@ def whole_loop(threads):
     with tempfile.TemporaryDirectory() as out, contextlib.redirect_stdout(io.StringIO()) as text:
         stage, sys.argv = script("03_train_policy"), ["03", "--updates", "4000", "--reports", "1", "--threads", str(threads),
                                                       "--out", out]
-        stage.measure = stage.draw_skills = stage.draw_robots = lambda *_: None
+        stage.measure = stage.draw_skills = lambda *_: None
         stage.main()
     return float(text.getvalue().split(" updates/s")[0].split()[-1])
 
@@ -104,7 +105,7 @@ class Follow(gymnasium.Env):
     SKILL_STEPS, the reward of Eq. 6 with the deviation that 03 ends with, an episode of EPISODE steps that is no terminal one."""
 
     def __init__(self, decoder, seed):
-        self.decoder, self.rng, self.robots = decoder, np.random.default_rng(seed), common.Robots(common.robot_spec("ant"), 1, 1)
+        self.decoder, self.rng, self.robots = decoder, np.random.default_rng(seed), common.Robots(robot_spec("ant"), 1, 1)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (28,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1, 1, (8,), np.float32)
 
@@ -113,7 +114,7 @@ class Follow(gymnasium.Env):
 
     def skill(self):
         z = torch.from_numpy(self.rng.normal(size=(1, 2))).float()
-        self.command, self.log_var = (v.detach() for v in common.first_step(self.decoder, z))
+        self.command, self.log_var = (v[:, 0] for v in self.decoder(z, 1))
 
     def reset(self, seed=None, options=None):
         self.robots.reset(np.array([0]), self.rng)
@@ -155,11 +156,12 @@ def tracking_after(minutes, threads):
             return time.time() - self.start < 60 * minutes
 
     torch.set_num_threads(threads)
-    decoder = common.unpack(common.load("pretrained", "wetvae", "main", 0)["decoder"])
+    decoder = common.load("pretrained", "wetvae", "main", 0)["decoder"]
     envs = DummyVecEnv([lambda seed=seed: Follow(decoder, seed) for seed in range(4)])
     model = SAC("MlpPolicy", envs, gradient_steps=-1, device="cpu", seed=0)  # an update for each environment step, its default
     model.learn(10 ** 9, callback=Clock())
-    policy = s3.as_policy(Theirs(model), decoder, ["speed", "direction", "curvature"], {})
+    policy = SimpleNamespace(actor=Theirs(model), decoder=decoder, names=["speed", "direction", "curvature"], relation={},
+                             scale=s3.STEP_SCALE, method="wedis")
     return s3.tracking(policy, False)
 
 

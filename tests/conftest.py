@@ -16,7 +16,8 @@ import torch
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
-import common
+import common  # before mujoco
+import mujoco
 
 torch.set_num_threads(1)
 S1, S2, S3, S4 = "01_make_dataset", "02_train_wetvae", "03_train_policy", "04_mpc_maze"
@@ -27,6 +28,15 @@ def script(name):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def robot_spec(name):
+    return mujoco.MjSpec.from_file(str(ROOT / f"{name}.xml"))
+
+
+def load_policy(out, experiment, seed):
+    """A policy artifact as 03 and 04 use it."""
+    return SimpleNamespace(**common.load(out, "policy", experiment, seed))
 
 
 for number, name in (("s1", S1), ("s2", S2), ("s3", S3), ("s4", S4)):
@@ -61,8 +71,8 @@ def out(tmp_path):
                                        ("speed_acc", 1, ["speed", "acceleration"], None),
                                        ("polar", 2, ["x", "y"], None)):
         torch.manual_seed(0)
-        common.save(tmp_path, "wetvae", name, 0, {}, decoder=common.pack(common.Decoder(len(names), x_dim, 16, circle)),
-                    names=names, ranges={name: (-1.0, 1.0) for name in names}, length=5)
+        common.save(tmp_path, "wetvae", name, 0, {}, decoder=common.Decoder(len(names), x_dim, 16, circle),
+                    names=names, relation=dict(curvature=0.2) if len(names) == 3 else {}, ranges={name: (-1.0, 1.0) for name in names}, length=5)
     return tmp_path
 
 
@@ -71,8 +81,6 @@ def inside(monkeypatch, capsys):
     """inside(stage, *flags) runs a stage's main in this process, without pictures: exit code, stdout, stderr."""
     def run(stage, *flags):
         monkeypatch.setattr(sys, "argv", [stage.__file__, *map(str, flags)])
-        if hasattr(stage, "draw_robots"):
-            monkeypatch.setattr(stage, "draw_robots", lambda: None)
         monkeypatch.setattr(stage, "save_figure", lambda figure, *_: common.plt.close(figure), raising=False)
         code, constants = 0, {name: value for name, value in vars(stage).items() if name.isupper()}
         try:

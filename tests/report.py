@@ -214,8 +214,8 @@ def scripts():
         error, closed = (number(policy[0][key]) for key in ("tracking_error", "tracking_error_closed"))
         minutes = f"{number(policy[0]['train_minutes'], '.0f')} ({CORES[policy[0]['threads']]})"
         expect = f"tracking error {error} open loop, {closed} closed loop"
-    rows.append(["`python 03_train_policy.py`", minutes, "skill policy of the Ant, Fig 5, 14", expect])
-    rows.append(["`python 04_mpc_maze.py`", minutes_of_04(), "mazes, Fig 3, 6, 8, 17, GIFs", "the table above"])
+    rows.append(["`python 03_train_policy.py`", minutes, "skill policy of the Ant, Fig 5", expect])
+    rows.append(["`python 04_mpc_maze.py`", minutes_of_04(), "mazes, Fig 3, 6, 8, 14, 17, GIFs", "the table above"])
     return markdown(["command", "minutes", "makes", "expect (seed 0)"], rows)
 
 
@@ -379,7 +379,7 @@ MAP = [  # what, places: script, text to look for
     ("Alg. 1, first loop", [("02", "def train(")]),
     ("Alg. 1, \"Test: check factors in z\"", [("02", "def check_factors")]),
     ("Fig 4, 10 to 13", [("02", "def draw_traversals"), ("02", "def measure(")]),
-    ("Alg. 1, \"Test: find relation functions\"", [("03", "def calibrate_relation")]),
+    ("Alg. 1, \"Test: find relation functions\"", [("02", "def find_relation")]),
     ("relation functions, Sec. 4.2.2", [("common", "def next_skill")]),
     ("Alg. 1, second loop", [("03", "def train_wedis")]),
     ("Eq. 5, 6", [("03", "def reward(")]),
@@ -483,7 +483,7 @@ def full_policies():
                         for end in ("_open", ""))])
         if row["method"] == "wedis":
             second.append([*name, *(f"{number(row.get(f'purity_{axis}_open'))}, {number(row.get(f'purity_{axis}'))}"
-                                    for axis in common.SINGLE + common.MULTI)])
+                                    for axis in (*common.SINGLE, *common.MULTI))])
     return markdown(["policy", "seed", "updates", "environment steps", "minutes", "tracking error, open", "closed",
                      "following error, median m, open", "closed", "90 % m, open", "closed", "falls %, open", "closed"],
                     first) + [

@@ -52,9 +52,10 @@ def dads(s3):
     def sample(n, recent=None):
         pick = torch.randint(300, (n,))
         return [part[pick] for part in stored]
-    return SimpleNamespace(decoder=q, sac=Sac(), sample=sample, z=None, renew=lambda z: None, warm=lambda: True,
-                           act=lambda z: None, collect=lambda: None,
-                           adam=torch.optim.SGD(q.parameters(), lr=0.0), losses={}, stored=stored)
+    run = SimpleNamespace(decoder=q, sac=Sac(), sample=sample, z=None, renew=lambda z: None, warm=lambda: True,
+                          act=lambda z: None, collect=lambda: None, learn=lambda *steps: s3.Run.learn(run, *steps),
+                          adam=torch.optim.SGD(q.parameters(), lr=0.0), losses={}, stored=stored)
+    return run
 
 
 def information(q, displacement, z, others):
@@ -112,7 +113,8 @@ def sectar(s3):
     vars(s3).update(METHOD="sectar", ROBOTS=6, SKILL_STEPS=5, Z_DIM=4, RECENT=60, MODEL_BATCH=40, RELABELLED=0.0,
                     UPDATES_PER_STEP=4, UPDATES=1, BATCH=200, REWARD_SCALE=0.3)
     run = SimpleNamespace(widths=(3, 1, 3, 2, 4), steps=4 * 5 + 3, sac=Sac(), losses={}, warm=lambda: True,
-                          z=torch.zeros(6, 4), renew=lambda z: None, act=lambda c: None, collect=lambda: None)
+                          z=torch.zeros(6, 4), renew=lambda z: None, act=lambda c: None, collect=lambda: None,
+                          learn=lambda *steps: s3.Run.learn(run, *steps))
     run.model = dict(encoder=common.layers(2 * 5, 8, 2 * 4), decoder=common.Decoder(4, 2, 8))
     run.decoder = run.model["decoder"]
     run.replay = torch.zeros(4 * 5 * 6, 13)

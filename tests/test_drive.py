@@ -14,7 +14,7 @@ from pathlib import Path
 import common
 import pytest
 import torch
-from conftest import ROOT
+from conftest import ROOT, load_policy
 from test_maze import make_policy
 
 
@@ -128,6 +128,6 @@ def test_sliders_reach_the_policy_through_the_viewer(folder):
     assert not err
     commands = torch.tensor([[float(v) for v in line.split()[1:]] for line in out.splitlines() if line.startswith("command")])
     assert commands[:10].norm(dim=1).max() <= common.CORRECTION + 1e-6  # it stands still: no more than the correction
-    policy = common.load_policy(folder, "ant_semi", 0)
+    policy = load_policy(folder, "ant_semi", 0)
     expected = common.commands_of(policy, torch.tensor([[1.0, -0.5, 0.5]]), 1)[0, 0]
     assert (commands - expected).abs().amax(1).min() < 1e-4

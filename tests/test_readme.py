@@ -30,11 +30,7 @@ def test_readme_is_short():
     assert len(README.encode()) <= 16 * 1024
 
 
-TOO_LONG = pytest.mark.xfail(reason="above DESIGN's budget still: open in issue 16")
-
-
-@pytest.mark.parametrize("file", ["01_make_dataset.py", "02_train_wetvae.py"] + [
-    pytest.param(file, marks=TOO_LONG) for file in ("03_train_policy.py", "04_mpc_maze.py", "common.py")])
+@pytest.mark.parametrize("file", LINES)
 def test_script_is_short(file):
     assert len((ROOT / file).read_text(encoding="utf-8").splitlines()) <= LINES[file]
 
@@ -45,7 +41,6 @@ def test_no_line_is_wide(file):
     assert [n for n, line in enumerate(lines, 1) if len(line) > 110] == []
 
 
-@TOO_LONG
 def test_scripts_together_are_short():
     assert sum((ROOT / file).stat().st_size for file in LINES) <= 115 * 1024
 

@@ -158,7 +158,6 @@ def test_every_constant_can_be_changed_in_the_file(stage, name, inside, out, mon
     if stage == S3:
         method = dict(ant_dads="dads", ant_sectar="sectar").get(experiment, "wedis")
         row = dict(METHOD=method, Z_DIM=4 if method == "sectar" else 2)
-        monkeypatch.setattr(module, "calibrate_relation", lambda *_: dict(curvature=0.2))  # half of the time
         if name not in ("DIRECTIONS", "FIGURE", "SINGLE_RUN", "MULTI_RUN"):
             monkeypatch.setattr(module, "draw_skills", lambda policy: None)
     if stage == S4:
