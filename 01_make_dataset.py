@@ -16,13 +16,13 @@ from common import parse_flags, plt, save, save_figure, stop, weak_labels
 EXPERIMENT = "main"     # row of EXPERIMENTS below
 SEED = 0                # random seed
 OUT = "runs"            # folder of all that is written
-FIGURE = ""             # name of the figure, which shows direction and curvature ("": dataset_<experiment>)
+FIGURE = ""             # name of the figure, if there are direction and curvature ("": dataset_<experiment>)
 
 TRAJECTORIES = 100_000  # N, App. A.1.1
 LENGTH = 5              # T, transitions per trajectory
-FACTORS = "speed direction curvature"  # what is drawn; without direction trajectories have one dimension
-SPEED_LOW = 0.0         # speed ~ U(SPEED_LOW, SPEED_HIGH), trajectory units per transition; in 1D both ways:
-SPEED_HIGH = 1.0        # U(-SPEED_HIGH, SPEED_HIGH) (Table 1); only acceleration makes longer transitions
+FACTORS = "speed direction curvature"  # without direction trajectories have one dimension
+SPEED_LOW = 0.0         # speed ~ U(SPEED_LOW, SPEED_HIGH), Table 1, trajectory units per transition
+SPEED_HIGH = 1.0        # in one dimension ~ U(-SPEED_HIGH, SPEED_HIGH)
 DIRECTION = 90.0        # direction ~ U(-DIRECTION, DIRECTION), degrees: the right-sided semicircle
 CURVATURE = 30.0        # curvature ~ U(-CURVATURE, CURVATURE), degrees per transition; + turns left
 ACCELERATION = 0.2      # acceleration ~ U(-ACCELERATION, ACCELERATION) times the speed per transition
@@ -58,7 +58,7 @@ def check(names, limits):
     if max(DIRECTION, CURVATURE) > 180:
         stop("--direction and --curvature must be at most 180")
     for name in names:
-        if limits[name][0] >= limits[name][1] or (name in common.MULTI and STRAIGHT >= 1):
+        if limits[name][0] >= limits[name][1] or name in common.MULTI and (STRAIGHT >= 1 or LENGTH == 1):
             stop(f"{name} is the same in all trajectories: widen its range, or leave it out of --factors")
     if "curvature" in names and "direction" not in names:
         stop("--factors with curvature needs direction too: one dimension has no turns")
@@ -103,11 +103,11 @@ def draw(trajectories, factors, ranges):
     """Fig 9: the labelling criteria (left, middle) and trajectories by their curvature label (right)."""
     figure, (fan, turns, data) = plt.subplots(1, 3, figsize=(10.5, 3.9))
     speed, direction, curvature = weak_labels(factors, ["speed", "direction", "curvature"], ranges).T
-    hues = np.array([common.RED, "#009E73", common.BLUE, "#CC79A7"])
-    fan.scatter(*trajectories[:, 1].T, s=4, color=hues[direction], alpha=0.15 + 0.2 * speed)
-    for k, m in np.ndindex(4, 4):  # in the middle of each class; directions count from the left downwards
-        size, angle = (np.interp(share, (0, 1), ranges[name]) for name, share in
-                       (("speed", (k + 0.5) / 4), ("direction", (3.5 - m) / 4)))
+    speeds, directions = common.CLASSES["speed"], common.CLASSES["direction"]
+    fan.scatter(*trajectories[:, 1].T, s=4, c=direction, cmap="viridis", alpha=0.2 + 0.6 * speed / speeds)
+    for k, m in np.ndindex(speeds, directions):  # in the middle of each class
+        size = np.interp((k + 0.5) / speeds, (0, 1), ranges["speed"])
+        angle = np.interp((m + 0.5) / directions, (1, 0), ranges["direction"])  # class 1: the largest angles
         fan.text(size * math.cos(angle), size * math.sin(angle), f"{k + 1},{m + 1}", ha="center", va="center")
     fan.set(title="labels (speed, direction)", xlabel="first transition: x", ylabel="y", aspect="equal")
     colours = (common.GREY, common.BLUE, common.RED)

@@ -2,7 +2,7 @@
 
 In: runs/dataset_*.npz of 01. Trains the WET-VAE (Eq. 4) and, to compare, the same model without labels (the
 trajectory VAE); finds which latent is which factor, and the relation functions. Out, below runs/:
-wetvae_<experiment>_seed<seed>.pt (and .._none), a figure, results/wetvae.csv and crosstalk.csv.
+wetvae_<experiment>_seed<seed>.pt (and .._none), a figure and results/wetvae.csv.
 Takes 35 s, 1.7 minutes with the trajectory VAE (one core). Expect purity 0.91, 0.91, 0.92, mean of 10 seeds.
 """
 import hashlib
@@ -43,9 +43,9 @@ BATCH = 512            # trajectories per update (the paper: 2048)
 EPOCHS = 12            # passes over the data (the paper: 300)
 LEARNING_RATE = 2e-3   # of Adam, falls linearly to 0 (the paper: 2e-4, fixed)
 
-Z_RANGE = 1.5          # ends of the traversals drawn, and of the skills that fit the relation functions
+Z_RANGE = 1.5          # traversals are drawn, and relation functions found, from -Z_RANGE to Z_RANGE
 FIGURE = ""            # name of the figure of traversals ("": traversals_<experiment>)
-MODELS = {"": {}}      # models of a row: end of the file's name, and the constants in which it differs
+MODELS = {"": {}}      # models of an experiment: {end of the file's name: the constants that differ}
 COLUMNS = []           # columns of its figure: title, model, T ([]: each model, at the T of the data)
 # With the beta of the WET-VAE the latents of the trajectory VAE collapse (KL 0.000): no fair comparison.
 NONE = dict(LABELLED=False, GAMMA=0.0, BETA=1.0, BETA_WARM_UP=0.0, EPOCHS=24)
@@ -65,12 +65,11 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
                          BETA=4.0, FIGURE="fig13_four_factors", MODELS={"": {}, "circle": dict(CIRCLE=True)}),
     "full": dict(DATA="full", FIGURE="full_circle_traversals", MODELS={"": {}, "circle": dict(CIRCLE=True)}),
 }
-FREE = {"OUT", "TRAIN", "RESUME", "THREADS", "FIGURE"}  # change no model
+FREE = {"OUT", "TRAIN", "RESUME", "THREADS", "Z_RANGE", "FIGURE"}  # change no model
 
 
 class Encoder(nn.Module):
     """q_phi(z | tau, y), Fig 1 (the state decoder is common.Decoder): an LSTM over displacements and labels.
-
     circle: index of a latent that is an angle, a turn from -1.5 to 1.5. Its mean is the direction of two
     outputs: a single output would have to jump from one end to the other where the circle closes."""
 
@@ -124,7 +123,7 @@ class LabelDecoders(nn.Module):
         return [self.scale[m] * read[m] @ order + self.bias[m] for m, order in enumerate(self.order)]
 
 
-# ------------------------------------------------ the objective and its training, Eq. 4 and Alg. 1
+# -------- the objective and its training, Eq. 4 and Alg. 1
 
 def log_normal(x, mean, log_var):
     """log N(x; mean, exp(log_var)), elementwise. The trap: torch's gaussian_nll_loss bounds the variance."""
@@ -133,7 +132,7 @@ def log_normal(x, mean, log_var):
 
 def divergence(mean, log_var, circle):
     """D_KL(q(z | tau, y) || p(z)) of each latent (B, z_dim). p is N(0, 1); of an angle it is uniform over the
-    turn; noise is treated as if it did not wrap, which is at most 0.1 too little."""
+    turn; q is taken as if it did not wrap, which makes the divergence too small by at most 0.1."""
     kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var)
     if circle is not None:
         entropy = 0.5 * (math.log(2 * math.pi * math.e) + log_var[:, circle])
@@ -192,8 +191,8 @@ def train(networks, data, variant, settings):
 
 @torch.no_grad()
 def check_factors(decoder, names, steps):
-    """Alg. 1, "Test: check factors in z", from the decoder alone: decodes latents of the prior, and finds
-    which is which factor by the largest total |correlation|. Sets decoder.axes, the signed permutation after
+    """Alg. 1, "Test: check factors in z", from the decoder alone: decodes samples of the prior, and matches
+    latents with factors by the largest total |correlation|. Sets decoder.axes, the signed permutation after
     which axis m of z is factor m and + is more of it. Returns the |correlations| (M,)."""
     n = len(names)
     z = torch.randn(5000, n, generator=torch.Generator().manual_seed(0))
@@ -209,16 +208,16 @@ def check_factors(decoder, names, steps):
 
 
 @torch.no_grad()
-def find_relation(decoder, names, steps, reach):
+def find_relation(decoder, names, steps):
     """Alg. 1, "Test: find relation functions": for each factor of z_multi the weight with which single steps
     and the relation function (common.next_skill) come nearest to the decoder's free run of `steps`. Returns
     {factor: weight} and prints how far the two are apart (RMS, as a share of the RMS step)."""
-    grid, relation = torch.linspace(-reach, reach, 13), {}
+    grid, relation = torch.linspace(-Z_RANGE, Z_RANGE, 13), {}
     for factor in [name for name in names if MULTI.get(name) in names]:
-        z = torch.zeros(len(grid) ** 2, len(names))  # direction 0: it stays within the range of the data
+        z = torch.zeros(len(grid) ** 2, len(names))  # direction 0: a turn stays within the data's directions
         z[:, [0, names.index(factor)]] = torch.cartesian_prod(grid, grid)  # the first axis is the speed
         free, errors = decoder(z, steps)[0], {}
-        for weight in np.linspace(-1, 1, 401).round(4).tolist():
+        for weight in sorted(np.linspace(-1, 1, 401).round(4).tolist(), key=abs):  # of equals the smallest
             skills = SimpleNamespace(method="wedis", decoder=decoder, names=names, relation={factor: weight})
             chain = commands_of(skills, z, steps)
             errors[weight] = ((chain - free).square().mean() / free.square().mean()).sqrt().item()
@@ -228,9 +227,9 @@ def find_relation(decoder, names, steps, reach):
     return relation
 
 
-def weak_supervision(dataset, x, settings):
+def weak_supervision(dataset, x, settings, key):
     """The factors of interest {name: (low, high)}, in the order of z in all stages, and the classes of their
-    labels (N, M). Ends with one line if the settings do not fit the data, before anything is trained."""
+    labels (N, M). Exits with 2 if the settings of model `key` do not fit the data."""
     truth = dict(zip(dataset["names"].tolist(), dataset["factors"].T.astype(np.float64)))
     ranges = dict(zip(truth, dataset["ranges"].tolist()))
     if x.shape[2] == 2:
@@ -242,9 +241,10 @@ def weak_supervision(dataset, x, settings):
     ranges = {name: ranges[name] for name in truth if name in asked}
     if len(x) < settings["BATCH"]:
         stop(f"data set {DATA!r}: {len(x)} trajectories are fewer than --batch {settings['BATCH']}")
-    closed = np.ptp(ranges.get("direction", [0])) > 6.28
-    if settings["CIRCLE"] and not (closed and settings["LABELLED"] and settings["OWN_AXIS"]):
-        stop("--circle true needs --data full, direction in --labels, --labelled true and --own_axis true")
+    circle = np.ptp(ranges.get("direction", [0])) > 6.28
+    if settings["CIRCLE"] and not (circle and settings["LABELLED"] and settings["OWN_AXIS"]):
+        stop(f"model {key!r}: --circle true needs data of the full circle, direction in --labels, "
+             "--labelled true and --own_axis true")
     y = weak_labels(truth, list(ranges), ranges)
     for m, name in enumerate(ranges):
         counts = np.bincount(y[:, m], minlength=common.CLASSES[name])
@@ -258,17 +258,19 @@ def main():
     config, given = parse_flags(globals())
     torch.set_num_threads(THREADS)
     models = {}
+    if not MODELS or {key for _, key, _ in COLUMNS} - set(MODELS):
+        stop(f"COLUMNS shows models that are not in MODELS: {' '.join(MODELS)}")
     for key, changes in MODELS.items():
+        for name, value in changes.items():
+            if name not in config or name in FREE | {"EXPERIMENT", "SEED", "DATA", "DATA_SEED"}:
+                stop(f"{name} of model {key!r} is no constant in which models of a row can differ")
+            changes = changes | {name: common.convert(value, config[name], f"model {key!r}: {name}")}
         settings = config | changes | given  # flags override rows
-        for name, value in settings.items():
-            if name not in config:
-                stop(f"{name} of model {key!r} is no constant of this file")
-            settings[name] = common.convert(value, config[name], f"model {key!r}: {name}")
         models[key] = {name: value for name, value in settings.items() if name not in FREE}
     if TRAIN:
         dataset = load(OUT, "dataset", DATA, DATA_SEED)
         x = torch.from_numpy(np.diff(dataset["trajectories"], axis=1))  # displacements, App. A.1.2
-        supervision = {key: weak_supervision(dataset, x, settings) for key, settings in models.items()}
+        supervision = {key: weak_supervision(dataset, x, models[key], key) for key in models}
 
     trained = {}
     for key, settings in models.items():
@@ -289,8 +291,8 @@ def main():
             settings["DATASET"] = hashlib.sha256(x.numpy().tobytes()).hexdigest()  # other data, other model
             seconds = train(nn.ModuleList([encoder, decoder, heads]), (x, one_hot, y), variant, settings)
             abs_corr = check_factors(decoder, names, x.shape[1])  # Alg. 1, "Test"
-            relation = find_relation(decoder, names, x.shape[1], settings["Z_RANGE"])  # Alg. 1, last line
-            same = str(sorted(item for item in settings.items() if item[0] not in ("SEED", "Z_RANGE")))
+            relation = find_relation(decoder, names, x.shape[1])  # Alg. 1, last line
+            same = str(sorted(item for item in settings.items() if item[0] != "SEED"))  # rows of all seeds
             save(OUT, "wetvae", variant, SEED, settings, decoder=decoder, encoder=encoder.state_dict(),
                  names=names, ranges=ranges, relation=relation, length=x.shape[1], seconds=seconds,
                  abs_corr=abs_corr.tolist(), settings=hashlib.sha256(same.encode()).hexdigest()[:8])
@@ -301,24 +303,24 @@ def main():
     draw_traversals(trained)
 
 
-# ------------------------------------------------ measuring and drawing: not needed to understand the method
+# -------- measuring and drawing: not needed to understand the method
 
 @torch.no_grad()
 def traverse(decoder, axis, values, steps):
     """Displacements (len(values), steps, x_dim) decoded while one axis runs over values, the others at 0."""
     z = torch.zeros(len(values), len(decoder.axes))
     if decoder.x_dim == 1:
-        z[:, 0] = -1.0  # a speed that is not 0: at 0 nothing can accelerate (Fig 12)
+        z[:, 0] = -1.0  # but the speed in 1D: at 0 nothing can accelerate (Fig 12)
     z[:, axis] = torch.as_tensor(values, dtype=torch.float32)
     return decoder(z, steps)[0].double().numpy()
 
 
 def measure(label, model):
-    """Print and save what a model has learnt: a row per factor in results/wetvae.csv, C in crosstalk.csv."""
+    """Print and save what a model has learnt: a row per factor in results/wetvae.csv."""
     decoder, names, config = model["decoder"], model["names"], model["config"]
     values, reach = np.linspace(-1.5, 1.5, 61), 3.0 if decoder.circle is None else 1.5
     curves = [factors_of(traverse(decoder, i, values, model["length"]), names) for i in range(len(names))]
-    (C, purity), rows, cells = cross_talk(curves, model["ranges"]), [], []
+    (C, purity), rows = cross_talk(curves, model["ranges"]), []
     same = dict(experiment=EXPERIMENT, seed=SEED, labels=label)
     print(f"axis: cross-talk with {' '.join(names)}; purity, |corr|, decoded factor for z in [-1.5, 1.5]")
     for i, name in enumerate(names):
@@ -336,18 +338,16 @@ def measure(label, model):
         print(text)
         rows.append(same | dict(
             beta=config["BETA"], gamma=config["GAMMA"], factor=name, abs_corr=corr, purity=pure,
+            crosstalk=", ".join(f"{other} {c:.2f}" for other, c in zip(names, C[i])),
             range_low=curve.min(), range_high=curve.max(), largest_gap_deg=gap,
             train_seconds=round(model["seconds"]), settings=model["settings"]))
-        cells += [same | dict(axis=name, factor=other, crosstalk=c) for other, c in zip(names, C[i])]
     update_csv(Path(OUT) / "results" / "wetvae.csv", rows, (*same, "factor"))
-    update_csv(Path(OUT) / "results" / "crosstalk.csv", cells, (*same, "factor", "axis"))
 
 
 def draw_traversals(trained):
     """Fig 4, 10 to 13: a row per axis, a column per (title, model, T). Lines have the colour of the latent's
     value; where they would hide one another, points have the colour of time and the latent is on y."""
-    columns = [column for column in COLUMNS if column[1] in trained] or [
-        (model["title"], key, model["length"]) for key, model in trained.items()]
+    columns = COLUMNS or [(model["title"], key, model["length"]) for key, model in trained.items()]
     names = max((model["names"] for model in trained.values()), key=len)
     heights = [0.5 if name in ("speed", "acceleration") else 1.0 for name in names]
     width = min(4.5, max(2.6, 9 / len(columns)))

@@ -42,36 +42,35 @@ ROBOTS = 256             # robots that step together
 EPISODE = 200            # steps until a robot starts anew; not terminal: the value beyond is bootstrapped
 SKILL_STEPS = 25         # steps until a robot is given a new skill
 WARM_UP = 10_000         # steps with random actions; their statistics normalise the state
-REPLAY = 1_000_000       # size of the replay buffer R, steps; at least two skills of all robots
+REPLAY = 1_000_000       # size of the replay buffer R, steps; raised, if need be, to two skills of all robots
 UPDATES_PER_STEP = 8     # updates in each step of all robots
 BATCH = 256              # App. A.1.3
-RELABELLED = 0.5         # share of a batch that is given a fresh skill (hindsight relabelling; the paper: 0)
+RELABELLED = 0.5         # share of a batch that is relabelled with a fresh skill (the paper: 0)
 CORRECTED = 0.25         # share of skills with a random correction, as the closed loop adds it (the paper: 0)
 
 HIDDEN = 256             # width of the two hidden layers (the paper: 512)
 LEARNING_RATE = 1e-3     # Adam (the paper: 3e-4, fixed)
 DECAY_FROM = 0.5         # share of the updates after which the learning rate falls linearly to 0
-ACTOR_EVERY = 2          # actor and value network learn once in so many updates of the critics (the paper: 1)
+ACTOR_EVERY = 2          # actor and value network learn once in so many updates of the critics (usual: 1)
 AVERAGED = 0.002         # rate of the running average of the actor's weights, which is the policy (1: actor)
 DISCOUNT = 0.98          # gamma of Eq. 1 (the paper: 0.99): a shorter horizon teaches to follow sooner
 SMOOTHING = 0.01         # of the target value network, App. A.1.3
 REWARD_SCALE = 0.1       # of Eq. 6 (the paper: 1)
 TEMPERATURE = 0.003      # alpha, weight of the entropy (the paper: 0.01, which is 0.001 at our reward scale)
-FLOOR_START = 0.04       # metres, least deviation in the reward; if small at first, robots stand still
-FLOOR_END = 0.01         # its value from 0.6 of the updates on (it shrinks from 0.15): teaches slow skills
-
-Z_RANGE = 1.5            # ends of a traversed axis, and of the skills that fit the relation weights
+FLOOR_START = 0.04       # metres, least standard deviation in the reward; if small, robots stand still
+FLOOR_END = 0.01         # the same from 60 % of the updates on; it shrinks after 15 %: teaches slow skills
 
 # Baselines only
 Z_DIM = 2                # entries of z: DADS 2, SeCTAR 8
 RECENT = 40_000          # latest steps that a baseline's model learns from
 MODEL_BATCH = 256        # steps (DADS) or trajectories (SeCTAR) in a batch of theirs
 PRIOR_SAMPLES = 100      # L of DADS's reward
-EXPLORE = 0.5            # SeCTAR: share of trajectories that are the explorer's (0: no explorer)
+EXPLORE = 0.5            # SeCTAR: share of trajectories that are the explorer's (0.0: no explorer)
+EXPLORER = 3.0           # the last entry of its z, and the length of its commands: far beyond N(0, I)
 KL_WEIGHT = 2.0          # SeCTAR: of the KL divergence in its ELBO
 
 # Measuring only: never an obstacle to --resume
-DIRECTIONS = 5           # of the tracking grid, from -Z_RANGE to Z_RANGE of z_dir
+Z_RANGE = 1.5            # the axes of z are measured from -Z_RANGE to Z_RANGE
 SINGLE_RUN = (1, 100)    # T and H_z of the tracking error, and of Fig 5 for axes of z_single, Sec. 6.1.2
 MULTI_RUN = (5, 40)      # T and H_z of the following error and of purity, and of Fig 5 for axes of z_multi
 TRAVERSAL = 13           # skills on each axis at which purity is measured
@@ -83,7 +82,7 @@ SECTAR = dict(METHOD="sectar", UPDATES=66_000, Z_DIM=8, SKILL_STEPS=50, RECENT=5
               REWARD_SCALE=1.0, SINGLE_RUN=(50, 1), MULTI_RUN=(50, 1))  # as many minutes as WEDIS
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
     "ant_semi": dict(FIGURE="fig05_skills_wedis"),
-    "ant_full": dict(DECODER="full_circle", DIRECTIONS=16, FIGURE="fig15_full_circle"),
+    "ant_full": dict(DECODER="full_circle", FIGURE="fig15_full_circle"),
     "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, BASE_FRAME=False,
                          VARIANCE_SCALE=0.05, ROBOTS=64, SKILL_STEPS=100, CORRECTED=0.5, DISCOUNT=0.97,
                          Z_RANGE=1.0, MULTI_RUN=(6, 20), FIGURE="fig16_half_cheetah"),
@@ -92,10 +91,10 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs from
     "ant_sectar": SECTAR | dict(FIGURE="fig05_skills_sectar"),
     "ant_sectar_no_explorer": SECTAR | dict(EXPLORE=0.0),  # what the explorer is good for
 }
-MAY_DIFFER = ("OUT TRAIN RESUME THREADS REPORTS UPDATES DIRECTIONS SINGLE_RUN MULTI_RUN TRAVERSAL NOISY "
-              "STARTS FIGURE").split()  # from a checkpoint's
+MAY_DIFFER = ("OUT TRAIN RESUME THREADS REPORTS UPDATES Z_RANGE SINGLE_RUN MULTI_RUN TRAVERSAL NOISY STARTS "
+              "FIGURE").split()  # from those of a checkpoint
 
-# ---------------------------------------------------------------- SAC (Haarnoja et al. 2017), App. A.1.3
+# -------- SAC (Haarnoja et al. 2017), App. A.1.3
 
 class Critics(nn.Module):
     """Q_1 and Q_2 as one stack of batched matrix products (one call for both): (B, n), (B, m) -> (2, B)."""
@@ -156,11 +155,10 @@ class Sac(nn.Module):
         if self.updates % ACTOR_EVERY:
             return q_loss.item()
         a_new, log_prob = self.actor(x)
-        a_leaf = a_new.detach().requires_grad_()
-        q_new = self.critics(x, a_leaf).min(0).values
-        # the trap: a backward through q_new also fills the critics' gradients; so take dQ/da first
-        slope, = torch.autograd.grad(q_new.sum(), a_leaf)
-        actor_loss = (TEMPERATURE * log_prob - (slope * a_new).sum(1)).mean()  # gradient of alpha log pi - Q
+        self.critics.requires_grad_(False)  # or backward computes their gradients too
+        q_new = self.critics(x, a_new).min(0).values
+        self.critics.requires_grad_(True)
+        actor_loss = (TEMPERATURE * log_prob - q_new).mean()
         v_loss = 0.5 * ((self.value(x).squeeze(1) - (q_new - TEMPERATURE * log_prob).detach()) ** 2).mean()
         loss = actor_loss + v_loss  # they share no parameter
         self.actor_adam.zero_grad()
@@ -172,7 +170,7 @@ class Sac(nn.Module):
         return loss.item()
 
 
-# ---------------------------------------------------------------- Algorithm 1, policy training
+# -------- Algorithm 1, policy training
 
 def reward(mean, log_var, displacement, floor):
     """log p of Eq. 6 for one step, (B,), without its normaliser, which depends on the skill alone. mean,
@@ -186,13 +184,13 @@ def train_wedis(run):
     x_dim, m1 = run.decoder.x_dim, run.z.shape[1] - run.decoder.x_dim
 
     def draw(n):
-        """z_single ~ prior and, side by side, a correction of the command as the closed loop adds it."""
+        """z_single ~ prior and, beside it, a correction of the command as the closed loop adds it."""
         length = CORRECTION * torch.rand(n, 1).sqrt() * (torch.rand(n, 1) < CORRECTED)
         correction = length * nn.functional.normalize(torch.randn(n, x_dim))
         return torch.cat([torch.randn(n, m1), correction], 1)
 
     def command_of(z):
-        """z of draw -> mean and log-variance of the commanded step, (n, 2 or 1) each."""
+        """z of draw -> mean, moved by the correction, and log-variance of the step, (n, 2 or 1) each."""
         mean, log_var = run.decoder(z[:, :m1], 1)  # Alg. 1: z = (z_single, 0)
         return mean[:, 0] + z[:, m1:], log_var[:, 0]
 
@@ -209,15 +207,21 @@ def train_wedis(run):
             z = torch.where(fresh, draw(len(z)), z)  # any stored step can be judged by any skill
             command, log_var = command_of(z)
             r = reward(command, log_var, displacement, floor)  # Alg. 1: compute the reward, Eq. 6
-            run.learn(s, a, s2, command, command, r)  # Alg. 1: optimize psi and the critics with the SAC
+            # Alg. 1: optimize psi and the critics with the SAC; the value is that of going on with the skill
+            run.learn(s, a, s2, command, command, r)
         run.collect()  # Alg. 1: the samples go to the replay buffer R
+
+
+def make_robots(n, threads):
+    return Robots(mujoco.MjSpec.from_file(str(HERE / f"{ROBOT}.xml")), n, threads)
 
 
 class Run:
     """What the three loops share: robots, replay buffer, SAC, clock, reports and checkpoints."""
 
     def __init__(self, decoder, names, z_dim, c_dim, fixed, model=None):
-        self.decoder, self.names, self.fixed = decoder, names, fixed
+        self.decoder, self.names = decoder, names
+        self.fixed = fixed  # what a checkpoint must agree with
         self.rng = np.random.default_rng(SEED)
         self.robots = make_robots(ROBOTS, 1)
         self.robots.reset(np.arange(ROBOTS), self.rng)
@@ -299,8 +303,8 @@ class Run:
 
     def report(self):
         """One line, one point of the learning curve, and a checkpoint."""
-        policy = SimpleNamespace(actor=self.sac.average, decoder=self.decoder, names=self.names, relation={},
-                                 scale=STEP_SCALE, method=METHOD)
+        policy = SimpleNamespace(actor=self.sac.average, decoder=self.decoder, names=self.names,
+                                 scale=STEP_SCALE, method=METHOD, relation={})  # in the grid z_multi is 0
         row = dict(updates=self.sac.updates, env_steps=self.steps * ROBOTS, minutes=self.seconds / 60,
                    tracking_error=tracking(policy, False))
         if self.names:
@@ -330,7 +334,7 @@ class Run:
         self.rng.bit_generator.state = state["numpy_rng"]
 
 
-# ---------------------------------------------------------------- main
+# -------- main
 
 def main():
     config, _ = parse_flags(globals())
@@ -338,30 +342,32 @@ def main():
     fixed = {name: value for name, value in config.items() if name not in MAY_DIFFER}
     source = load(OUT, "wetvae", DECODER, DECODER_SEED)
     decoder, names = source["decoder"], source["names"]
-    check_constants(decoder, names)
+    check_constants(source)
     torch.manual_seed(SEED)
     if TRAIN:
+        shared = fixed | dict(DECODER_SHA256=source["sha256"])  # with a checkpoint
         if METHOD == "wedis":
             m1 = sum(name in SINGLE for name in names)
-            run = Run(decoder, names, m1 + decoder.x_dim, decoder.x_dim, fixed)
+            run = Run(decoder, names, m1 + decoder.x_dim, decoder.x_dim, shared)
             train_wedis(run)
         else:
-            decoder, names = Decoder(Z_DIM, 2, 64), []  # no names mark a baseline everywhere
+            decoder, names = Decoder(Z_DIM, 2, 64), []  # an empty list of names marks a baseline
             model = dict(decoder=decoder)
             if METHOD == "sectar":
                 model["encoder"] = layers(2 * SKILL_STEPS, 64, 2 * Z_DIM)
-            run = Run(decoder, names, Z_DIM, Z_DIM if METHOD == "dads" else 2, fixed, model)
+            run = Run(decoder, names, Z_DIM, Z_DIM if METHOD == "dads" else 2, shared, model)
             dict(dads=train_dads, sectar=train_sectar)[METHOD](run)
         save(OUT, "policy", EXPERIMENT, SEED, config, actor=run.sac.average, decoder=decoder, method=METHOD,
-             robot=ROBOT, names=names, relation=source["relation"], scale=STEP_SCALE, length=source["length"],
-             curve=run.curve, updates=run.sac.updates, env_steps=run.steps * ROBOTS, seconds=run.seconds)
+             robot=ROBOT, names=names, relation=source["relation"], scale=STEP_SCALE, curve=run.curve,
+             updates=run.sac.updates, env_steps=run.steps * ROBOTS, seconds=run.seconds)
     policy = SimpleNamespace(**load(OUT, "policy", EXPERIMENT, SEED, **fixed))
     measure(policy, source["ranges"])
     draw_skills(policy)
 
 
-def check_constants(decoder, names):
-    """Whatever makes no sense ends here, before training, with what fits."""
+def check_constants(source):
+    """Exits with 2 if constants do not fit together, or to the decoder of 02."""
+    decoder, names = source["decoder"], source["names"]
     if METHOD not in ("wedis", "dads", "sectar") or ROBOT not in ("ant", "half_cheetah"):
         stop("--method is wedis, dads or sectar; --robot is ant or half_cheetah")
     if ROBOT != "ant" and (BASE_FRAME or METHOD != "wedis"):
@@ -372,21 +378,23 @@ def check_constants(decoder, names):
     if not known or decoder.x_dim != make_robots(1, 1).places:
         stop(f"the decoder {DECODER} has axes {' '.join(names)} and predicts {decoder.x_dim} coordinates, "
              f"which does not fit the {ROBOT}: choose another --decoder or --robot")
-    for name in "STEP_SCALE VARIANCE_SCALE LEARNING_RATE FLOOR_START FLOOR_END Z_RANGE".split():
-        if globals()[name] <= 0:
-            stop(f"--{name.lower()} must be above 0")
+    if weak := [name for name, corr in zip(names, source["abs_corr"]) if corr < 0.5]:
+        print(f"the decoder {DECODER} has no latent that means {' or '.join(weak)}")
+    rates = LEARNING_RATE, AVERAGED, SMOOTHING
+    if min(STEP_SCALE, VARIANCE_SCALE, *rates, FLOOR_START, FLOOR_END, Z_RANGE) <= 0:
+        stop("scales, rates, floors and --z_range must be above 0")
     if DISCOUNT >= 1 or max(RELABELLED, CORRECTED, EXPLORE, AVERAGED, SMOOTHING, DECAY_FROM) > 1:
         stop("--discount is below 1; shares and rates are at most 1")
-    if EPISODE % SKILL_STEPS or not all(isinstance(n, int) for n in SINGLE_RUN + MULTI_RUN):
-        stop("--skill_steps must divide --episode; --single_run and --multi_run are whole numbers")
+    if EPISODE % SKILL_STEPS or not all(isinstance(n, int) and n > 0 for n in SINGLE_RUN + MULTI_RUN):
+        stop("--skill_steps must divide --episode; --single_run and --multi_run are whole and above 0")
 
 
-# ================================================================ Baselines: not needed to understand WEDIS
+# ======== Baselines: not needed to understand WEDIS
 
 def train_dads(run):
     """Sharma et al. 2019: skills z ~ U(-1, 1)^2. The reward is the mutual information of step and z under the
-    skill dynamics q(displacement | z), a Gaussian (theirs: a mixture of four), learnt at the same time.
-    Rewards of old steps use the present q."""
+    skill dynamics q(displacement | z), a Gaussian (theirs: a mixture of four), learnt at the same time. In
+    the base frame z is turned as if it were a displacement."""
 
     def log_q(displacement, z):
         """log q up to a constant: displacement (B, 2), own z (B, 2) -> (B,); (B, 1, 2), (L, 2) -> (B, L)."""
@@ -416,17 +424,14 @@ def train_dads(run):
             fresh = torch.rand(len(z), 1) < RELABELLED
             z = torch.where(fresh, torch.rand(z.shape) * 2 - 1, z)
             run.learn(s, a, s2, z, z, REWARD_SCALE * information(displacement, z))
-            run.losses["loss"] = loss.item()
+            run.losses["model_loss"] = loss.item()
         run.collect()
 
 
-EXPLORER = 3.0  # last entry of the z of SeCTAR's explorer: far from N(0, I), and no plan asks for it
-
-
 def train_sectar(run):
-    """Co-Reyes et al. 2018: skills z ~ N(0, I); the VAE learns from the trajectories of an explorer, the same
-    policy with commands of length 3 in any direction. Reward of a skill: the likelihood of ending where
-    the decoder says; of the explorer: how far along its command the VAE cannot reconstruct."""
+    """Co-Reyes et al. 2018: skills z ~ N(0, I); a VAE learns from the trajectories of an explorer, the same
+    policy with very long commands. Reward: of a skill, minus the distance between its end and the decoder's;
+    of the explorer, how much farther along its command it comes than what the VAE makes of its trajectory."""
     encoder, decoder = run.model["encoder"], run.decoder
 
     def elbo(x):
@@ -461,9 +466,9 @@ def train_sectar(run):
         run.act(commands[:, run.steps % SKILL_STEPS])
         if run.warm() and run.steps >= SKILL_STEPS:
             _, _, _, x, z = trajectories(MODEL_BATCH, RECENT)
-            mine = (z[:, 0, -1] == EXPLORER) | (EXPLORE == 0)
+            used = (z[:, 0, -1] == EXPLORER) | (EXPLORE == 0)
             log_p, kl, _ = elbo(x / STEP_SCALE)
-            loss = ((KL_WEIGHT * kl - log_p) * mine).sum() / mine.sum().clamp(min=1)
+            loss = ((KL_WEIGHT * kl - log_p) * used).sum() / used.sum().clamp(min=1)
             run.adam.zero_grad()
             loss.backward()
             run.adam.step()
@@ -476,8 +481,7 @@ def train_sectar(run):
             z[fresh] = torch.randn(int(fresh.sum()), Z_DIM)
             with torch.no_grad():
                 decoded = torch.where(explorer[:, None, None], elbo(x)[2], decoder(z, SKILL_STEPS)[0])
-            # Laplace likelihood of the place where a trajectory ends, shared among its steps. The trap:
-            # the likelihood of single steps is highest for a robot that stands still
+            # Laplace likelihood of the end. The trap: that of single steps is highest for standing still
             error = x - decoded
             direction = torch.where(explorer[:, None], z[:, :2], -error.sum(1))
             r = REWARD_SCALE * (error * nn.functional.normalize(direction)[:, None]).sum(2)
@@ -485,15 +489,11 @@ def train_sectar(run):
             c2 = torch.cat([c[:, 1:], c[:, -1:]], 1)
             order = torch.randperm(r.numel())
             run.learn(*(part.flatten(0, 1)[order] for part in (s, a, s2, c, c2, r)))
-            run.losses["loss"] = loss.item()
+            run.losses["model_loss"] = loss.item()
         run.collect()
 
 
-# ================================================================ Measuring and drawing: not needed for WEDIS
-
-def make_robots(n, threads):
-    return Robots(mujoco.MjSpec.from_file(str(HERE / f"{ROBOT}.xml")), n, threads)
-
+# ======== Measuring and drawing: not needed for WEDIS
 
 def upside_down(robots):
     """Which robots have turned over (n,): the torso's z axis points down."""
@@ -512,15 +512,16 @@ def traversal(policy, axis, values):
 
 
 def grid(policy):
-    """Skills of the tracking error, z_multi = 0: 5 speeds x DIRECTIONS (on a rail 8 speeds), DADS 5 x 5,
-    SeCTAR 25 fixed draws from the prior."""
+    """Skills of the tracking error, z_multi = 0: 5 speeds x 5 directions (full circle: 16; on a rail: 8
+    speeds), DADS 5 x 5, SeCTAR 25 fixed draws from the prior."""
     if METHOD == "sectar":
         return torch.randn(25, Z_DIM, generator=torch.Generator().manual_seed(0))
     z = torch.linspace(-Z_RANGE, Z_RANGE, 8)[:, None]
     if policy.decoder.x_dim == 2:
-        circle = policy.decoder.circle is not None  # its two ends are one direction
-        directions = torch.linspace(-Z_RANGE, Z_RANGE, DIRECTIONS + circle)[:DIRECTIONS]
-        z = torch.cartesian_prod(torch.linspace(-Z_RANGE, Z_RANGE, 5), directions)
+        speeds = directions = torch.linspace(-Z_RANGE, Z_RANGE, 5)
+        if policy.decoder.circle is not None:
+            directions = torch.linspace(-Z_RANGE, Z_RANGE, 17)[:-1]  # the two ends are one direction
+        z = torch.cartesian_prod(speeds, directions)
     return nn.functional.pad(z, (0, (len(policy.names) or Z_DIM) - z.shape[1]))
 
 
@@ -556,7 +557,7 @@ def tracking(policy, closed):
 
 def following(policy, closed):
     """Following error: three random skills one after another from noisy starts. Returns median and 90 %
-    quantile of |executed - predicted end| of a skill, metres, and the share of robots that ever turn over."""
+    quantile of |end - sum of commands| of a skill, metres, and the share of robots that ever turn over."""
     rng = np.random.default_rng(SEED)
     robots = make_robots(STARTS, THREADS)
     robots.reset(np.arange(STARTS), rng)
@@ -575,7 +576,7 @@ def following(policy, closed):
 
 
 def executed_cross_talk(policy, ranges, closed):
-    """cross_talk of executed skills, from steps of a fifth of a skill, a mean of noisy starts."""
+    """cross_talk of executed skills: of each, five displacements that are means over NOISY starts."""
     values, curves = np.linspace(-Z_RANGE, Z_RANGE, TRAVERSAL), []
     every = max(1, MULTI_RUN[0] * MULTI_RUN[1] // 5)
     for axis in range(len(policy.names)):
@@ -616,8 +617,8 @@ def draw_skills(policy):
         values = np.linspace(-1, 1, 9 if rail else 5)
         colours = ["#D55E00", "#009E73", "#0072B2", "#56B4E9", "#F0E442"]  # the paper's, for the colour-blind
         if name == "direction" and policy.decoder.circle is not None:
-            values = np.linspace(-1.5, 1.5, DIRECTIONS + 1)[:-1]
-            colours = plt.get_cmap("twilight")(np.linspace(0.1, 0.9, DIRECTIONS))
+            values = np.linspace(-1.5, 1.5, 17)[:-1]
+            colours = plt.get_cmap("twilight")(np.linspace(0.1, 0.9, 16))
         z = traversal(policy, i, values)
         paths = [predicted_path(policy, z, run)]
         paths += [roll_out(policy, z, run, closed) for closed in (False, True)[:len(rows) - 1]]
@@ -631,6 +632,11 @@ def draw_skills(policy):
             for line, dots, value, colour in zip(path, marks, values, colours):
                 ax.plot(*line.T, color=colour, lw=1.3, label=f"{value:g}")
                 ax.plot(*dots.T, "o", ms=3 if len(dots) < 10 else 0, color=colour)
+        if not rail:  # a square, with one scale for the column
+            (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
+            reach = max(x1 - x0, y1 - y0) / 2
+            ax.set(xlim=((x0 + x1) / 2 - reach, (x0 + x1) / 2 + reach),
+                   ylim=((y0 + y1) / 2 - reach, (y0 + y1) / 2 + reach))
         axes[0, i].set_title(f"$z_{{{name}}}$, $T$ = {run[0]}, $H_z$ = {run[1]}")
         axes[-1, i].set_xlabel("x (m)")
     for ax, text in zip(axes[:, 0], rows):

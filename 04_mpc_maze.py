@@ -10,7 +10,7 @@ import hashlib
 import io
 import time
 from functools import cache, partial
-from itertools import product
+from itertools import cycle, product
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -55,7 +55,7 @@ EPSILON = 5.0               # epsilon, metres: acceptable error; a trial that en
 RADIUS = 1.0                # metres by which the planner grows the walls: the reach of the Ant's legs
 GOAL = (24.0, 12.0)         # x and y, metres; the Ant starts at (0, 0), 26.8 m away, 36 m along the axes
 
-METHODS = {  # Table 2; a row overrides a maze's, so s_maze's HOLD never reaches WEDIS-NTS
+METHODS = {  # Table 2. The later wins: the file, EXPERIMENTS, MAZE, METHODS, flags
     "wedis": {},
     "wedis_s": dict(MODES="printed", LENGTH=1, PLANNED=4),            # single steps
     "wedis_nts": dict(MODES="printed", HOLD=1, LENGTH=20, PLANNED=4),  # no trajectory scaling
@@ -71,7 +71,8 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs; its
     "fig18": dict(MAZES="s_maze obstacles", REWARDS="dense", MODES="closed", POLICY_SEEDS="0 1 2",
                   DRAW="fig18"),  # 30 s
     "drive": dict(DRIVE=True, MAZES="open", MODES="closed"),
-    "matched": dict(METHOD=" ".join(METHODS), POLICY_SEEDS="0 1 2", TRIALS=20, DRAW="", LOOK_AHEAD="200 600"),
+    "matched": dict(METHOD=" ".join(METHODS), POLICY_SEEDS="0 1 2", TRIALS=20, DRAW="",
+                    LOOK_AHEAD="200 600"),  # all methods look equally far ahead
 }
 HULL = [(-7, -6, -7, 19), (31, 32, -7, 19), (-7, 32, -7, -6), (-7, 32, 18, 19)]  # x0, x1, y0, y1, metres
 MAZE = {  # walls, and the constants in which a maze differs; plan a row of your own with --mazes <its name>
@@ -86,10 +87,10 @@ MAZE = {  # walls, and the constants in which a maze differs; plan a row of your
 }
 
 
-# ---------------------------------------------------------------- Algorithm 2, Sec. 5
+# -------- Algorithm 2, Sec. 5
 # Lines are counted from "for i"; a skill's commands (lines 17 and 18) are computed at once.
-# A unit u is one method in one maze, one mode and one policy: all constants in lower case, after rows and
-# flags. All its cases (reward, N, H_P) with all their trials run in one simulation.
+# A unit u is one method, maze, mode and policy; it holds the constants, in lower case. All its cases (reward,
+# N, H_P) with all their trials run in one simulation.
 
 def skill_pool(u):
     """The skills that plans draw from: z (POOL, M), and the displacements that they predict (POOL, T, 2),
@@ -153,7 +154,8 @@ def run(u):
     for first in range(0, len(trials), u.trials):  # every case has the same starts
         robots.reset(np.arange(first, first + u.trials), np.random.default_rng(u.seed))
     torch.manual_seed(u.seed)
-    pool, closed, poses = skill_pool(u), u.mode == "closed", [robots.qpos.copy()]
+    pool, closed = skill_pool(u), u.mode == "closed"
+    poses = [robots.qpos.copy()]
     for i in range(skills):                                                 # line 1
         chosen = []
         for t, s0 in zip(trials, robots.place()):                           # line 20, of the round before
@@ -174,9 +176,8 @@ def run(u):
         rows.append(dict(
             maze=u.maze, reward=t.reward, method=u.method, mode=u.mode, look_ahead=t.planned * skill_steps,
             samples=t.samples, trial=t.trial, seed=u.seed, final_distance=distance[-1],
-            min_distance=distance.min(), success=int(distance[-1] < u.epsilon),
-            planning_ms=1e3 * t.time / skills, policy_seed=u.policy_seed, policy=u.policy.sha256[:8],
-            settings=u.settings))
+            success=int(distance[-1] < u.epsilon), planning_ms=1e3 * t.time / skills,
+            policy_seed=u.policy_seed, policy=u.policy.sha256[:8], settings=u.settings))
     return rows, [t for t in trials if t.trial < 3]
 
 
@@ -186,8 +187,9 @@ def main():
     if DRIVE:
         import drive  # not in the paper
         return drive.drive(units[0], maze_spec(units[0]), skill_pool(units[0]), plan, SECONDS, PORT)
-    path, start, examples, done = Path(OUT) / "results" / f"{EXPERIMENT}.csv", time.time(), [], set()
-    if path.exists() and not NEED_PATHS & set(DRAW.split()):
+    path, start = Path(OUT) / "results" / f"{EXPERIMENT}.csv", time.time()
+    examples, done = [], set()
+    if path.exists() and set(DRAW.split()) <= {"fig06", "fig07", "fig14"}:  # others need the paths
         done = {row.get("settings") for row in common.read_csv(path)}
     for u in units:
         if u.settings in done:
@@ -221,20 +223,18 @@ def maze_spec(u):
 def collides(path, walls, radius):
     """Which transitions of paths (N, K + 1, 2) touch a wall grown by radius, metres: (N, K) bool. Exact, by
     separating axes: segment and rectangle are apart if they are along x, along y, or across the segment."""
-    x, y = path.unbind(2)
-    low_x, high_x = torch.minimum(x[:, :-1], x[:, 1:]), torch.maximum(x[:, :-1], x[:, 1:])
-    low_y, high_y = torch.minimum(y[:, :-1], y[:, 1:]), torch.maximum(y[:, :-1], y[:, 1:])
-    hit = torch.zeros(low_x.shape, dtype=torch.bool)
+    (x, y), (dx, dy) = path[:, :-1].unbind(2), path.diff(dim=1).unbind(2)
+    low, high = torch.minimum(path[:, :-1], path[:, 1:]), torch.maximum(path[:, :-1], path[:, 1:])
+    hit = torch.zeros(x.shape, dtype=torch.bool)
     for x0, x1, y0, y1 in walls:
         x0, x1, y0, y1 = x0 - radius, x1 + radius, y0 - radius, y1 + radius
-        n, k = ((low_x <= x1) & (high_x >= x0) & (low_y <= y1) & (high_y >= y0)).nonzero(as_tuple=True)
-        dx, dy = x[n, k + 1] - x[n, k], y[n, k + 1] - y[n, k]
-        across = dx * (y[n, k] - (y0 + y1) / 2) - dy * (x[n, k] - (x0 + x1) / 2)
-        hit[n, k] |= across.abs() <= (dx.abs() * (y1 - y0) + dy.abs() * (x1 - x0)) / 2
+        near = ((low <= torch.tensor([x1, y1])) & (high >= torch.tensor([x0, y0]))).all(2)
+        across = dx * (y - (y0 + y1) / 2) - dy * (x - (x0 + x1) / 2)
+        hit |= near & (across.abs() <= (dx.abs() * (y1 - y0) + dy.abs() * (x1 - x0)) / 2)
     return hit
 
 
-# ---------------------------------------------------------------- what is planned: rows, flags, checks
+# -------- what is planned: rows, flags, checks
 
 # rows of MAZE and METHODS may not set these
 OF_A_RUN = "EXPERIMENT OUT THREADS DRAW METHOD MAZES DRIVE SECONDS PORT".split()
@@ -246,7 +246,7 @@ def words(text, name, allowed):
     for word in text.split() or [""]:
         if word not in allowed:
             stop(f"unknown {word!r} in --{name}; allowed: {' '.join(allowed)}")
-    return text.split()
+    return list(dict.fromkeys(text.split()))
 
 
 def numbers(text, name, like=1):
@@ -255,8 +255,8 @@ def numbers(text, name, like=1):
 
 
 def settings(method, maze, config, given):
-    """The constants of a method in a maze: those of the file and EXPERIMENTS (config), over them MAZE's row,
-    over it METHODS' row, over all the flags (given). Exits with 2 if they make no sense."""
+    """The constants of a method in a maze. The later wins: config (file, EXPERIMENTS), MAZE, METHODS, given
+    (flags). Exits with 2 if they make no sense."""
     rows, of = MAZE[maze] | METHODS[method], f"{method} in {maze}"
     walls = rows.pop("WALLS", [])
     for name, value in rows.items():
@@ -301,7 +301,7 @@ def units_of(config, given):
     return units
 
 
-# ---------------------------------------------------------------- measuring, drawing: not part of the method
+# -------- measuring, drawing: not part of the method
 
 def values_of(rows, column, **where):
     """A column of the rows that agree with where: (policies, trials), empty if there are none."""
@@ -332,11 +332,11 @@ def print_table(rows):
         print(line, *cells, sep=" | ")
 
 
-def draw_maze(ax, u, title, goal):
+def draw_maze(ax, u, title, marker):
     for x0, x1, y0, y1 in u.walls:
         ax.add_patch(plt.Rectangle((x0, y0), x1 - x0, y1 - y0, color="#7a869a", lw=0))
     ax.plot(0, 0, "o", ms=5, color="black")
-    ax.plot(*u.goal, goal, ms=9, color=RED)
+    ax.plot(*u.goal, marker, ms=9, color=RED)
     ax.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=title)
 
 
@@ -365,21 +365,22 @@ def draw_fig07(rows, units, examples):
     dashed: the goal's distance from the start."""
     panels, rng = dict.fromkeys((row["maze"], row["reward"]) for row in rows), np.random.default_rng(0)
     curves = dict.fromkeys((u.method, u.mode) for u in units)
-    colours = [BLUE, RED, "#009E73", "#E69F00", "#CC79A7", "#56B4E9"]  # Okabe-Ito
+    sizes = sorted({int(row["samples"]) for row in rows})
+    looks = list(zip([BLUE, RED, "#009E73", "#E69F00", "#CC79A7", "#56B4E9"], "osD^vP"))  # Okabe-Ito
     figure, axes = plt.subplots(1, len(panels), figsize=(3.6 * len(panels), 4), sharey=True, squeeze=False)
     for ax, (maze, kind) in zip(axes[0], panels):
-        for n, (method, mode) in enumerate(curves):
+        for (method, mode), (colour, marker) in zip(curves, cycle(looks)):
             where = dict(maze=maze, reward=kind, method=method, mode=mode)
-            own = [row for row in rows if all(row[name] == value for name, value in where.items())]
-            sizes = sorted({int(row["samples"]) for row in own})
-            if not sizes:
+            found = {n: values_of(rows, "final_distance", samples=n, **where) for n in sizes}
+            found = {n: values for n, values in found.items() if values.size}
+            if not found:
                 continue  # a row of METHODS may plan for one reward only
-            values = [values_of(own, "final_distance", samples=size) for size in sizes]
-            low, high = np.quantile([resampled_means(v, rng) for v in values], [0.025, 0.975], axis=1)
-            ax.plot(sizes, [v.mean(1) for v in values], color=colours[n % 6], lw=0.5, alpha=0.6)
-            ax.fill_between(sizes, low, high, color=colours[n % 6], alpha=0.15)
-            ax.plot(sizes, [v.mean() for v in values], color=colours[n % 6], marker="osD^vP"[n % 6],
-                    label=f"{method}, {mode}")
+            means = [values.mean(1) for values in found.values()]
+            resampled = [resampled_means(values, rng) for values in found.values()]
+            low, high = np.quantile(resampled, [0.025, 0.975], axis=1)
+            ax.fill_between(list(found), low, high, color=colour, alpha=0.15)
+            ax.plot(list(found), means, color=colour, lw=0.5, alpha=0.6)
+            ax.plot(list(found), np.mean(means, 1), color=colour, marker=marker, label=f"{method}, {mode}")
         goal = next(u.goal for u in units if u.maze == maze)
         ax.axhline(np.linalg.norm(goal), ls="--", color=GREY)
         ax.set(xscale="log", xlabel="N, samples per plan", title=f"{maze}, {kind} reward")
@@ -394,9 +395,9 @@ def draw_examples(name, kind, rows, units, examples):
     seed = units[0].policy_seed
     shown = [example for example in examples if (example.reward, example.u.policy_seed) == (kind, seed)]
     if not shown:
-        return
+        return print(f"no {name}: no trial has the {kind} reward")
     wide = min(3, shown[0].u.trials)
-    high = len(shown) // wide
+    high = -(-len(shown) // wide)
     figure, axes = plt.subplots(high, wide, figsize=(3.6 * wide, 2.4 * high), squeeze=False)
     for ax, example in zip(axes.flat, shown):
         u, poses = example.u, example.poses
@@ -406,6 +407,8 @@ def draw_examples(name, kind, rows, units, examples):
             ax.plot(*ends.T, "--", color=GREY, lw=1.2)
             ax.plot(*path[:u.length + 1].T, ".-", color=BLUE, ms=4)
         ax.plot(*poses[:, :2].T, color=RED, lw=1.2)
+    for ax in axes.flat[len(shown):]:
+        ax.axis("off")
     figure.supxlabel("blue: predicted, orange: executed, dashed: error of the end", fontsize=9)
     common.save_figure(figure, OUT, name)
 
@@ -467,7 +470,6 @@ DRAWINGS = dict(fig03=draw_fig03, fig06=draw_fig06, fig07=draw_fig07, fig14=draw
                 fig08=partial(draw_examples, "fig08_mpc_examples", "sparse"),
                 fig17=partial(draw_examples, "fig17_more_examples", "dense"),
                 fig18=partial(draw_examples, "fig18_s_maze_obstacles", "dense"))
-NEED_PATHS = {"fig03", "fig08", "fig17", "fig18", "gif"}  # a run that draws one of these begins anew
 NEED_GL = {"fig14", "gif"}
 
 if __name__ == "__main__":

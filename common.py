@@ -36,11 +36,11 @@ CORRECTION = 0.2   # at most so much, trajectory units
 FASTEST = 1.0      # no command is longer, trajectory units: much longer ones than in training make falls
 SOFT_START = 20    # environment steps over which the longest command grows from 0.2 to FASTEST
 FORMAT = 3         # of the artifacts; raise it when the meaning of what is stored changes
-HERE = Path(__file__).parent
+HERE = Path(__file__).resolve().parent
 SCRIPT = {"dataset": "01_make_dataset.py", "wetvae": "02_train_wetvae.py", "policy": "03_train_policy.py"}
 
 
-# ---------------------------------------------------------------- command line
+# -------- command line
 
 def stop(message, code=2):
     """End with one line on stderr. Code 2: the input is wrong; 1: the run failed."""
@@ -59,14 +59,15 @@ def convert(value, like, name, least=0):
     if kind is tuple:
         parts = value if isinstance(value, tuple) else text.split()
         if len(parts) == len(like):
-            return tuple(convert(part, one, name, -1e9) for part, one in zip(parts, like))
-    if kind is int:
-        least = 0 if name.lower().endswith(("seed", "seeds", "port")) else 1
+            likes = [0.0 if "." in str(part) else one for part, one in zip(parts, like)]
+            return tuple(convert(part, one, name, -1e9) for part, one in zip(parts, likes))
+    if kind is int and least == 0 and not name.lower().endswith(("seed", "seeds", "port")):
+        least = 1
     with contextlib.suppress(ValueError):
         number = float(text)
         if kind in (int, float) and least <= number < math.inf and number == kind(number):
             return kind(number)
-    kinds = {bool: "true or false", int: f"a whole number of at least {least} (a share of nothing: 0.0)",
+    kinds = {bool: "true or false", int: f"a whole number of at least {least}, like {like} in the file",
              float: f"a number of at least {least:g}", tuple: f"{np.size(like)} numbers"}
     stop(f"{name} is {value!r}, but must be {kinds[kind]}")
 
@@ -100,11 +101,13 @@ def parse_flags(stage, argv=None):
     stage.update(rows[experiment] | given)
     config = {name: convert(stage[name], like, "--" + name.lower()) for name, like in likes.items()}
     stage.update(config)
+    if Path(stage["OUT"]).resolve() == HERE:
+        stop("--out is this repository itself; its figures/ and results/ are what is shipped")
     write_whole(Path(stage["OUT"]) / f".can_write_{os.getpid()}", b"").unlink()  # before any work is lost
     return config, {name: config[name] for name in given}
 
 
-# ---------------------------------------------------------------- artifacts and CSV
+# -------- artifacts and CSV
 
 def write_whole(path, data):
     """Write bytes to path, whole or not at all, under a name that no other process uses. Returns path."""
@@ -149,8 +152,8 @@ def load(out, kind, experiment, seed, **same):
     """Read an artifact from <out>/, else pretrained/, and say which. Returns its content and "sha256". Exits
     with 2 if it is missing, damaged, foreign, not finite, or made with other constants than those of same."""
     name = artifact_name(kind, experiment, seed)
-    row = experiment.removesuffix("_none").removesuffix("_circle")  # 02 makes these in one row
-    make = f"make it with: python {SCRIPT[kind.partition('-')[0]]} --experiment {row} --seed {seed}"
+    row = f"{experiment} or its beginning" if kind == "wetvae" else experiment  # 02: <row>_<model>
+    make = f"make it with: python {SCRIPT[kind.partition('-')[0]]} --seed {seed} --experiment {row}"
     paths = [path for path in (Path(out) / name, HERE / "pretrained" / name) if path.exists()]
     if not paths:
         stop(f"no {name} in {out}/ or pretrained/; {make}")
@@ -201,18 +204,18 @@ def read_csv(path):
     return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
 
 
-# ---------------------------------------------------------------- weak labels and factors
+# -------- weak labels and factors
 
 def weak_labels(factors, names, ranges):
     """Weak labels, App. A.1.1, A.3.1, Fig 9: factors {name: (N,)}, ranges {name: (low, high)} -> (N, M) int64
-    classes from 0. Curvature, acceleration: zero, positive, negative; the others: quarters of their range."""
+    classes from 0. Curvature, acceleration: zero, positive, negative; the others: parts of their range."""
     labels = []
     for name in names:
         if name in MULTI:
-            labels.append(np.sign(factors[name]).astype(int) % 3)
+            labels.append(np.sign(factors[name]).astype(int) % 3)  # 0, 1, 2
         else:
             labels.append(np.digitize(factors[name], np.linspace(*ranges[name], CLASSES[name] + 1)[1:-1]))
-        if name == "direction":  # from the left downwards
+        if name == "direction":  # the first class has the largest angles
             labels[-1] = CLASSES[name] - 1 - labels[-1]
     return np.stack(labels, 1)
 
@@ -252,7 +255,7 @@ def cross_talk(curves, ranges):
     return C, np.where(C.max(1) < 0.1, math.nan, C.diagonal() / C.sum(1).clip(1e-9))
 
 
-# ---------------------------------------------------------------- decoder, robot, actor, execution
+# -------- decoder, robot, actor, execution
 
 def layers(n_in, hidden, n_out):
     """Two hidden layers with ReLU."""
@@ -274,7 +277,7 @@ class Decoder(nn.Module):
         self.register_buffer("axes", torch.eye(z_dim))  # canonical z -> latents: a signed permutation
 
     def forward(self, z, steps):
-        """Canonical z (B, M): axis m is factor m, + is more of it; z_single is (z_single, 0) -> as unroll."""
+        """unroll for canonical z (B, M): axis m is factor m, + is more of it. z_single is (z_single, 0)."""
         return self.unroll(z @ self.axes[:z.shape[1]], steps)
 
     def unroll(self, z, steps):
@@ -297,7 +300,7 @@ def on_circle(z):
 
 def next_skill(z, names, relation):
     """The relation functions f, Sec. 4.2.2, 6.1.2, A.3.2: z (..., M) of one transition -> of the next. names
-    of the axes; relation {factor of z_multi: weight} (the paper: -0.2, -0.1 by hand; signs are its axes')."""
+    of the axes; relation {factor of z_multi: weight} (the paper: -0.2, -0.1 by hand, for its axes)."""
     z = z.clone()
     for factor, weight in relation.items():
         change = weight * z[..., names.index(factor)]
@@ -423,8 +426,7 @@ def closed_loop(c, reference, robots, scale):
 
 
 def execute(policy, robots, commands, hold, closed, deterministic):
-    """Alg. 2, lines 13-19: hold each of the commands (n, T, c_dim), trajectory units, for `hold` (H_z) steps.
-    Yields what Robots.step returns after each (for frames and stopping)."""
+    """Alg. 2, lines 13-19: hold each command (n, T, c_dim) for `hold` (H_z) steps. Yields after each step."""
     reference = robots.place()
     for c in commands.unbind(1):
         for _ in range(hold):
@@ -434,9 +436,7 @@ def execute(policy, robots, commands, hold, closed, deterministic):
                 reference = reference + policy.scale * c
 
 
-# ---------------------------------------------------------------- plots
-
-BLUE, RED, GREY = "#0072B2", "#D55E00", "#888888"
+BLUE, RED, GREY = "#0072B2", "#D55E00", "#888888"  # of all plots
 plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
                      "grid.alpha": 0.25, "figure.dpi": 110, "savefig.bbox": "tight", "legend.frameon": False,
                      "axes.titlesize": 10, "figure.constrained_layout.use": True})

@@ -24,8 +24,10 @@ def dot(place, *colour):
 def drive(u, spec, pool, plan, seconds, port):
     """Sliders in a web page command the Ant in real time. mujoco serves the page, to this machine alone.
     u, spec, pool: the unit, the maze and the skills of 04; plan: Algorithm 2, for the button."""
+    if not u.policy.names:
+        common.stop("driving needs WEDIS, whose axes have names")
     robots, data = common.Robots(spec, 1), mujoco.MjData(spec.compile())
-    hand = SimpleNamespace(mode="start again", closed=True, text="", geoms=[],  # both threads use it
+    hand = SimpleNamespace(mode="start again", closed=True, text="", geoms=[],  # set by the page's thread
                            z={"z_" + name: 0.0 for name in u.policy.names})
     asked, steps, start, pages = None, 0, time.monotonic(), []
     signal.signal(signal.SIGINT, signal.default_int_handler)  # Ctrl-C ends it below
@@ -57,11 +59,11 @@ def drive(u, spec, pool, plan, seconds, port):
                 gui.End()
                 self.viewer.extra_geoms[:] = hand.geoms
 
-        bind = web_viewer.web_server.bind_public_socket  # the trap: on every interface, without a password
+        bind = web_viewer.web_server.bind_public_socket  # would listen on every interface
         web_viewer.web_server.bind_public_socket = lambda host, port: bind("127.0.0.1", port)
         web_viewer.print = web_viewer._print_url_banner = lambda *words, **options: None
         logging.getLogger().setLevel("CRITICAL")  # errors of the viewer are raised as well
-        logging.getLogger("WebServer").addFilter(pages.append)  # who comes and goes; None hides it
+        logging.getLogger("WebServer").addFilter(pages.append)  # who comes and goes; None hides the line
         with launch_web.launch(viewer_protocol.ViewerConfig(http_port=port), plugins=[Panel()]) as handle:
             handle.set_model(data.model, data=data)
             while handle.is_running() and not 0 < seconds <= time.monotonic() - start:

@@ -55,7 +55,7 @@ def handlers():
 # ---------------------------------------------------------------- a tiny policy training
 
 TINY = dict(updates=24, robots=8, skill_steps=5, episode=20, warm_up=80, replay=800, batch=16, hidden=16, reports=2,
-            starts=4, noisy=2, traversal=3, single_run="1 4", multi_run="2 2", threads=1, directions=3)
+            starts=4, noisy=2, traversal=3, single_run="1 4", multi_run="2 2", threads=1)
 
 
 def tiny(out, **changed):
@@ -72,7 +72,8 @@ def out(tmp_path):
                                        ("polar", 2, ["x", "y"], None)):
         torch.manual_seed(0)
         common.save(tmp_path, "wetvae", name, 0, {}, decoder=common.Decoder(len(names), x_dim, 16, circle),
-                    names=names, relation=dict(curvature=0.2) if len(names) == 3 else {}, ranges={name: (-1.0, 1.0) for name in names}, length=5)
+                    names=names, relation=dict(curvature=0.2) if len(names) == 3 else {}, abs_corr=[0.9] * len(names),
+                    ranges={name: (-1.0, 1.0) for name in names}, length=5)
     return tmp_path
 
 

@@ -21,7 +21,6 @@ import common  # noqa: E402
 
 KEYS = {  # of each results file: the columns that name a row, or a group of rows that is replaced as a whole
     "wetvae": ("experiment", "seed", "labels", "factor"),
-    "crosstalk": ("experiment", "seed", "labels", "factor", "axis"),
     "policies": ("experiment", "seed"),
     "claims": ("claim", "mode", "maze", "reward", "better", "better_samples", "worse", "worse_samples"),
     "table2": ("method",),
@@ -436,10 +435,10 @@ def full_wetvae():
     for row in in_order(results("wetvae")):
         unit = " deg" if row["factor"] in ("direction", "curvature") else ""
         rows.append([row["experiment"], row["labels"], row["seed"], row["beta"], row["gamma"], row["factor"],
-                     number(row["purity"]), number(row["abs_corr"]),
+                     number(row["purity"]), row["crosstalk"], number(row["abs_corr"]),
                      f"{number(row['range_low'])} .. {number(row['range_high'])}{unit}",
                      number(row["largest_gap_deg"], ".1f"), row["train_seconds"]])
-    return markdown(["experiment", "labels", "seed", "beta", "gamma", "factor", "purity", "abs corr",
+    return markdown(["experiment", "labels", "seed", "beta", "gamma", "factor", "purity", "cross-talk", "abs corr",
                      "decoded over z in [-1.5, 1.5]", "largest empty angle, deg", "seconds"], rows) if rows else missing(
                          "WET-VAEs are", "python 02_train_wetvae.py")
 
@@ -457,16 +456,6 @@ def full_seeds():
     lines = markdown(["experiment", "labels", "factor", "mean purity", "95 % interval", "worst", "n (of which not unused)"],
                      rows) if rows else []
     return lines + ten_seeds()
-
-
-def full_crosstalk():
-    models = {}
-    for row in in_order(results("crosstalk")):
-        key = row["experiment"], row["labels"], row["seed"], row["axis"]
-        models.setdefault(key, []).append(f"{row['factor']} {number(row['crosstalk'])}")
-    rows = [[*key, ", ".join(cells)] for key, cells in models.items()]
-    return markdown(["experiment", "labels", "seed", "axis", "cross-talk"], rows) if rows else missing(
-        "Cross-talk is", "python 02_train_wetvae.py")
 
 
 def full_policies():
@@ -548,7 +537,6 @@ SECTIONS = [
      "below 0.1). Abs corr: of latent and factor, over decoded draws of the prior. Largest empty angle: of the directions "
      "that z_direction decodes to. Acceleration is a share of the speed per transition.", full_wetvae),
     ("Over seeds", "Rows of wetvae.csv with the same settings. Intervals: 95 % bootstrap of the mean over seeds (of three or more).", full_seeds),
-    ("Cross-talk: crosstalk.csv", "", full_crosstalk),
     ("Policies (03): policies.csv", "Tracking error: RMS(executed end - predicted end) / RMS(predicted end) over a grid of skills, "
      "100 steps from rest (SeCTAR: 25 draws, 50 steps). Following error: |executed - predicted end| of random skills of 200 steps "
      "(Half-Cheetah: 120) from 400 noisy starts, three in a row. Falls: robots that turn over in that time. Baselines have no "

@@ -137,7 +137,7 @@ def test_damaged_artifacts_are_refused_in_one_line(kind, damage, tmp_path, capsy
         common.load(tmp_path, kind, "x", 0)
     error = capsys.readouterr().err
     assert end.value.code == 2 and len(error.splitlines()) == 1 and path.name in error
-    assert f"make it with: python {common.SCRIPT[kind]} --experiment x --seed 0" in error
+    assert f"make it with: python {common.SCRIPT[kind]} --seed 0 --experiment x" in error
 
 
 def test_every_damage_is_found(tmp_path, capsys):

@@ -81,6 +81,13 @@ def test_seconds_end_it(folder):
     assert not err and re.search(r"\n[1-9]\d* steps, [\d.]+ a second\n$", out)
 
 
+def test_a_method_without_axes_is_one_line(folder):
+    make_policy(folder, "ant_dads", decoder=common.Decoder(2, 2, 8), method="dads", names=[], relation={})
+    process = run(folder, "--method", "dads", "--modes", "printed", "--policy_seeds", "0")
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 2 and len(err.splitlines()) == 1 and "driving needs WEDIS" in err, err
+
+
 def test_a_port_in_use_is_one_line(folder):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))

@@ -351,7 +351,7 @@ class Turning(nn.Module):
 
 @pytest.mark.parametrize("weight", [0.155, -0.31])
 def test_calibration_finds_the_weight_of_a_decoder_that_turns_exactly(s2, weight):
-    found = s2.find_relation(Turning(weight), ["speed", "direction", "curvature"], 5, 1.5)
+    found = s2.find_relation(Turning(weight), ["speed", "direction", "curvature"], 5)
     assert found == dict(curvature=pytest.approx(weight))
 
 
@@ -476,7 +476,7 @@ def test_a_row_of_ones_own_and_measuring_flags(s3, inside, out):
     assert inside(s3, *flags).returncode == 0
     policy = load_policy(out, "mine", 0)
     assert policy.config["TEMPERATURE"] == 0.01 and policy.config["ROBOTS"] == 4
-    more = "--resume true --starts 2 --directions 4 --traversal 5 --noisy 1 --figure x".split()
+    more = "--resume true --starts 2 --z_range 1 --traversal 5 --noisy 1 --figure x".split()
     for extra in (more, [*more, "--train", "false"]):
         assert inside(s3, *flags, *extra).returncode == 0
     done = inside(s3, *flags, "--resume", "true", "--hidden", 24)

@@ -91,18 +91,35 @@ def test_killed_three_times_it_ends_with_the_same_bits(fork, out):
     ("--experiment half_cheetah --base_frame true", "--base_frame false"),
     ("--experiment ant_sectar --z_dim 2", "--z_dim is at least 3"),
     ("--experiment ant_dads --robot half_cheetah", "--robot ant"), ("--experiment ant_dads --z_dim 3", "--z_dim 2"),
-    ("--decoder nope", "python 02_train_wetvae.py --experiment nope --seed 0"),
-    ("--experiment ant_full --decoder_seed 7", "python 02_train_wetvae.py --experiment full --seed 7"),
-    ("--robots 2.5", "a whole number"), ("--decoder_seed 7", "python 02_train_wetvae.py --experiment main --seed 7"),
+    ("--decoder nope", "python 02_train_wetvae.py --seed 0 --experiment nope or its beginning"),
+    ("--experiment ant_full --decoder_seed 7", "python 02_train_wetvae.py --seed 7 --experiment full_circle or its beginning"),
+    ("--robots 2.5", "a whole number"), ("--decoder_seed 7", "python 02_train_wetvae.py --seed 7 --experiment main or its beginning"),
     ("--method ppo", "--method is wedis, dads or sectar"), ("--robot dog", "--robot is ant or half_cheetah"),
-    ("--train false --seed 98", "python 03_train_policy.py --experiment ant_semi --seed 98"),
-    ("--discount 1", "below 1"), ("--relabelled 2", "at most 1"),
+    ("--train false --seed 98", "python 03_train_policy.py --seed 98 --experiment ant_semi"),
+    ("--averaged 0.0", "must be above 0"), ("--discount 1", "below 1"), ("--relabelled 2", "at most 1"),
     ("--skill_steps 7", "--skill_steps must divide --episode"),
     ("--updates 0", "--updates"), ("--multi_run 5", "2 numbers")])
 def test_03_ends_in_one_line_before_training(flags, message, s3, inside, out, monkeypatch):
     monkeypatch.setattr(s3.Run, "__init__", lambda *_: pytest.fail("it trains"))
     done = inside(s3, *tiny(out), *flags.split())
     assert one_line(done, 2) and message in done.stderr, done.stderr
+
+
+def test_a_checkpoint_of_another_decoder_is_one_line_and_a_weak_decoder_is_said_aloud(s3, inside, out):
+    done = inside(s3, *tiny(out))
+    assert done.returncode == 0 and "no latent" not in done.stdout
+    model = common.load(out, "wetvae", "main", 0)
+    common.save(out, "wetvae", "main", 0, {}, **{key: model[key] for key in ("decoder", "names", "relation", "ranges", "length")},
+                abs_corr=[0.9, 0.1, 0.9])
+    done = inside(s3, *tiny(out), "--resume", "true")
+    assert one_line(done, 2) and "has DECODER_SHA256 = " in done.stderr
+    assert "the decoder main has no latent that means direction" in done.stdout
+
+
+@pytest.mark.parametrize("stage", ["s1", "s2", "s3", "s4"])
+def test_the_repository_itself_is_no_place_for_results(stage, request, inside):
+    done = inside(request.getfixturevalue(stage), "--out", ROOT)
+    assert one_line(done, 2) and "--out is this repository itself" in done.stderr
 
 
 @pytest.mark.parametrize("experiment", ["ant_semi", "ant_dads", "ant_sectar"])
@@ -158,7 +175,7 @@ def test_every_constant_can_be_changed_in_the_file(stage, name, inside, out, mon
     if stage == S3:
         method = dict(ant_dads="dads", ant_sectar="sectar").get(experiment, "wedis")
         row = dict(METHOD=method, Z_DIM=4 if method == "sectar" else 2)
-        if name not in ("DIRECTIONS", "FIGURE", "SINGLE_RUN", "MULTI_RUN"):
+        if name not in ("FIGURE", "SINGLE_RUN", "MULTI_RUN"):
             monkeypatch.setattr(module, "draw_skills", lambda policy: None)
     if stage == S4:
         make_policy(out, "ant_semi")
