@@ -104,10 +104,10 @@ def draw(trajectories, factors, ranges):
     figure, (fan, turns, data) = plt.subplots(1, 3, figsize=(10.5, 3.9))
     speed, direction, curvature = weak_labels(factors, ["speed", "direction", "curvature"], ranges).T
     speeds, directions = common.CLASSES["speed"], common.CLASSES["direction"]
-    fan.scatter(*trajectories[:, 1].T, s=4, c=direction, cmap="viridis", alpha=0.2 + 0.6 * speed / speeds)
+    fan.scatter(*trajectories[:, 1].T, s=4, c=direction, cmap="Set2", vmax=7, alpha=(1 + speed) / speeds)
     for k, m in np.ndindex(speeds, directions):  # in the middle of each class
         size = np.interp((k + 0.5) / speeds, (0, 1), ranges["speed"])
-        angle = np.interp((m + 0.5) / directions, (1, 0), ranges["direction"])  # class 1: the largest angles
+        angle = np.interp(1 - (m + 0.5) / directions, (0, 1), ranges["direction"])  # 1: the largest angles
         fan.text(size * math.cos(angle), size * math.sin(angle), f"{k + 1},{m + 1}", ha="center", va="center")
     fan.set(title="labels (speed, direction)", xlabel="first transition: x", ylabel="y", aspect="equal")
     colours = (common.GREY, common.BLUE, common.RED)
