@@ -97,11 +97,11 @@ MAY_DIFFER = ("OUT TRAIN RESUME THREADS REPORTS UPDATES Z_RANGE SINGLE_RUN MULTI
 # -------- SAC (Haarnoja et al. 2017), App. A.1.3
 
 class Critics(nn.Module):
-    """Q_1 and Q_2 as one stack of batched matrix products (one call for both): (B, n), (B, m) -> (2, B)."""
+    """Q_1 and Q_2 side by side, as batched matrix products: faster than two. (B, n), (B, m) -> (2, B)."""
 
     def __init__(self, n_in):
         super().__init__()
-        networks = [layers(n_in, HIDDEN, 1)[::2] for _ in range(2)]  # torch's own initialisation
+        networks = [layers(n_in, HIDDEN, 1)[::2] for _ in range(2)]  # their linear layers
         pairs = list(zip(*networks))
         self.weights = nn.ParameterList(torch.stack([a.weight.T, b.weight.T]).detach() for a, b in pairs)
         self.biases = nn.ParameterList(torch.stack([a.bias, b.bias])[:, None].detach() for a, b in pairs)
@@ -114,8 +114,8 @@ class Critics(nn.Module):
 
 
 class Sac(nn.Module):
-    """Actor psi, twin critics, value and target network, with a fixed temperature. average: the policy that
-    is kept, a running average of the actor's weights (the actor itself varies from report to report)."""
+    """Actor psi, twin critics, value and target network, with a fixed temperature. average: the policy,
+    a running average of the actor's weights (the actor itself varies between reports)."""
 
     def __init__(self, s_dim, c_dim, a_dim):
         super().__init__()
@@ -185,7 +185,7 @@ def train_wedis(run):
 
     def draw(n):
         """z_single ~ prior and, beside it, a correction of the command as the closed loop adds it."""
-        length = CORRECTION * torch.rand(n, 1).sqrt() * (torch.rand(n, 1) < CORRECTED)
+        length = CORRECTION * torch.rand(n, 1).sqrt() * (torch.rand(n, 1) < CORRECTED)  # uniform in a disc
         correction = length * nn.functional.normalize(torch.randn(n, x_dim))
         return torch.cat([torch.randn(n, m1), correction], 1)
 
@@ -207,8 +207,7 @@ def train_wedis(run):
             z = torch.where(fresh, draw(len(z)), z)  # any stored step can be judged by any skill
             command, log_var = command_of(z)
             r = reward(command, log_var, displacement, floor)  # Alg. 1: compute the reward, Eq. 6
-            # Alg. 1: optimize psi and the critics with the SAC; the value is that of going on with the skill
-            run.learn(s, a, s2, command, command, r)
+            run.learn(s, a, s2, command, command, r)  # Alg. 1: optimize psi and the critics with the SAC
         run.collect()  # Alg. 1: the samples go to the replay buffer R
 
 
@@ -275,7 +274,7 @@ class Run:
         return self.replay[(self.steps * ROBOTS - 1 - back) % len(self.replay)].split(self.widths, 1)
 
     def learn(self, s, a, s2, c, c2, r):
-        """SAC updates from steps with their commands, one for each BATCH of them."""
+        """SAC updates, one for each BATCH of steps; c, c2: the commands before and after."""
         self.sac.schedule(self.sac.updates / UPDATES)
         x, x2 = self.sac.actor.inputs(s, c), self.sac.actor.inputs(s2, c2)
         for batch in zip(*(part.split(BATCH) for part in (x, a, x2, r))):

@@ -26,7 +26,7 @@ SEED = 0                    # random seed of the trials
 OUT = "runs"                # folder that everything is written to
 THREADS = 2                 # CPU threads
 DRAW = "fig03 fig06 fig08 fig14 fig17 gif"  # rows of DRAWINGS below
-DRIVE = False               # true: plan nothing, serve a page with a slider for each axis of z (drive.py)
+DRIVE = False               # true: only serve a page with a slider for each axis of z (drive.py)
 SECONDS = 0.0               # until the page ends by itself; 0: when it is closed
 PORT = 8080                 # of the page, on this machine alone; 0: the first free one
 
@@ -201,7 +201,7 @@ def main():
         print(f"{time.time() - start:4.0f} s  {u.title}", flush=True)
     present = {u.settings for u in units}
     rows = [row for row in common.read_csv(path) if row.get("settings") in present]
-    print(f"wrote {path}; distance to the goal at the end, mean, and share of trials nearer than EPSILON:")
+    print(f"wrote {path}; mean distance to the goal at the end, share of trials nearer than EPSILON:")
     print_table(rows)
     for name in DRAW.split():
         if name not in NEED_GL or can_render():
@@ -459,8 +459,9 @@ def draw_gif(rows, units, examples):
         model = spec.compile()
         model.vis.global_.azimuth, model.vis.global_.elevation = 90, -65
         model.stat.extent *= 0.37  # the camera stands near enough for the walls to fill the picture
-        frames = [Image.fromarray(picture).quantize(48, Image.Quantize.MAXCOVERAGE)
-                  for picture in render(model, example.poses[::8], 320, 480)]
+        pictures = [Image.fromarray(picture) for picture in render(model, example.poses[::8], 320, 480)]
+        palette = pictures[0].quantize(48, Image.Quantize.MAXCOVERAGE)  # one for all, or colours flicker
+        frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
         buffer = io.BytesIO()
         frames[0].save(buffer, "GIF", save_all=True, append_images=frames[1:], duration=80, loop=0)
         print(f"wrote {common.write_whole(Path(OUT) / 'figures' / f'{maze}.gif', buffer.getvalue())}")

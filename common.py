@@ -186,7 +186,7 @@ def update_csv(path, rows, key):
     new = [{k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in row.items()} for row in rows]
     replaced = {tuple(row[k] for k in key) for row in new}
     path.parent.mkdir(parents=True, exist_ok=True)
-    with open(f"{path}.lock", "w") as lock:  # one process at a time: seeds trained side by side share a file
+    with open(f"{path}.lock", "w") as lock:  # seeds trained side by side share a file
         if os.name == "posix":  # Windows has no fcntl
             import fcntl
             fcntl.flock(lock, fcntl.LOCK_EX)
