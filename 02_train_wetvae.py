@@ -47,7 +47,7 @@ Z_RANGE = 1.5          # traversals are drawn, and relation functions found, fro
 FIGURE = ""            # name of the figure of traversals ("": traversals_<experiment>)
 MODELS = {"": {}}      # models of an experiment: {end of the file's name: the constants that differ}
 COLUMNS = []           # columns of its figure: title, model, T ([]: each model, at the T of the data)
-# With the beta of the WET-VAE the latents of the trajectory VAE collapse (KL 0.000): no fair comparison.
+# With the beta of the WET-VAE the latents of the trajectory VAE collapse (KL 0.000).
 NONE = dict(LABELLED=False, GAMMA=0.0, BETA=1.0, BETA_WARM_UP=0.0, EPOCHS=24)
 PRINTED = dict(OWN_AXIS=False, BETA_WARM_UP=0.0)  # Eq. 4 as printed; mixes axes with some seeds
 EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
@@ -71,7 +71,7 @@ FREE = {"OUT", "TRAIN", "RESUME", "THREADS", "Z_RANGE", "FIGURE"}  # change no m
 class Encoder(nn.Module):
     """q_phi(z | tau, y), Fig 1 (the state decoder is common.Decoder): an LSTM over displacements and labels.
     circle: index of a latent that is an angle, a turn from -1.5 to 1.5. Its mean is the direction of two
-    outputs: a single output would have to jump from one end to the other where the circle closes."""
+    outputs: a single one would have to jump where the circle closes."""
 
     def __init__(self, x_dim, y_dim, z_dim, hidden, circle=None):
         super().__init__()
@@ -95,8 +95,8 @@ class Encoder(nn.Module):
 
 class LabelDecoders(nn.Module):
     """p_theta(y^m | z), the M label decoders of Eq. 4: MLPs over all of z (the paper) or, with own_axis, the
-    logits scale * z^m * order_k + bias_k of classes k. Without a fixed order, straight may lie at one end and
-    left beside right. On a circle, classes lie at their true angles: this fixes direction 0."""
+    logits scale * z^m * order_k + bias_k of classes k. Without an order, left may lie beside right. On a
+    circle, classes lie at their true angles: this fixes direction 0."""
 
     def __init__(self, labels, z_dim, hidden, circle, own_axis):
         super().__init__()
@@ -112,7 +112,7 @@ class LabelDecoders(nn.Module):
             self.order.append(torch.arange(0.0, sizes[m])[None])
             if name in MULTI:  # class 0, zero, lies between positive and negative
                 self.order[m] = torch.tensor([[0.0, 1.0, -1.0]])
-            if m == circle:  # the middle of each class, from the left downwards
+            if m == circle:  # the middle of each class
                 self.order[m] = on_circle(1.5 - 3 / sizes[m] * (self.order[m][0] + 0.5)).T
 
     def forward(self, z):
@@ -131,8 +131,8 @@ def log_normal(x, mean, log_var):
 
 
 def divergence(mean, log_var, circle):
-    """D_KL(q(z | tau, y) || p(z)) of each latent (B, z_dim). p is N(0, 1); of an angle it is uniform over the
-    turn; q is taken as if it did not wrap, which makes the divergence too small by at most 0.1."""
+    """D_KL(q(z | tau, y) || p(z)) of each latent (B, z_dim). p is N(0, 1), of an angle uniform over the turn;
+    q does not wrap, which makes the divergence too small by at most 0.1."""
     kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var)
     if circle is not None:
         entropy = 0.5 * (math.log(2 * math.pi * math.e) + log_var[:, circle])
@@ -145,7 +145,7 @@ def objective(encoder, decoder, label_decoders, x, one_hot, y):
     x (B, T, x_dim) displacements; the labels as one_hot (B, y_dim), side by side, and as classes y (B, M)."""
     mean, log_var = encoder(x, one_hot)
     z = mean + torch.randn_like(mean) * (0.5 * log_var).exp()  # z ~ q(z | tau, y)
-    # sum_t log p(s_t | s_1:t-1, z); in the place of s_1:t-1 the decoder reads its own means
+    # sum_t log p(s_t | s_1:t-1, z); in place of s_1:t-1 the decoder reads its own means
     states = log_normal(x, *decoder.unroll(z, x.shape[1])).sum((1, 2)).mean()
     logits = label_decoders(z)
     labels = -sum(F.cross_entropy(logits[m], y[:, m]) for m in range(len(logits)))  # sum_m log p(y^m | z)
@@ -155,25 +155,24 @@ def objective(encoder, decoder, label_decoders, x, one_hot, y):
 def train(networks, data, variant, settings):
     """Alg. 1, "WET-VAE training", in place. networks: encoder, decoder, label decoders; data: x, one_hot and
     y of objective, for all N trajectories. Returns the seconds it took."""
-    epochs, batch, per_epoch = settings["EPOCHS"], settings["BATCH"], len(data[0]) // settings["BATCH"]
-    optimizer = torch.optim.Adam(networks.parameters(), lr=settings["LEARNING_RATE"], fused=True)
-    done, seconds = 0, 0.0
+    optimizer = torch.optim.Adam(networks.parameters(), fused=True)
+    per_epoch, done, seconds = len(data[0]) // BATCH, 0, 0.0
     if RESUME and (Path(OUT) / common.artifact_name("wetvae-checkpoint", variant, SEED)).exists():
         state = load(OUT, "wetvae-checkpoint", variant, SEED, **settings)
         networks.load_state_dict(state["networks"])
         optimizer.load_state_dict(state["optimizer"])
         torch.set_rng_state(state["rng"])
         done, seconds = state["epoch"], state["seconds"]
-    for epoch in range(done + 1, epochs + 1):
+    for epoch in range(done + 1, EPOCHS + 1):
         clock = time.time()
-        for i, rows in enumerate(torch.randperm(len(data[0])).split(batch)[:per_epoch]):  # Alg. 1: B ~ D
+        for i, rows in enumerate(torch.randperm(len(data[0])).split(BATCH)[:per_epoch]):  # Alg. 1: B ~ D
             states, labels, kl = objective(*networks, *(part[rows] for part in data))
-            progress = (epoch - 1 + i / per_epoch) / epochs
-            beta = settings["BETA"]
-            if progress < settings["BETA_WARM_UP"]:
-                beta *= progress / settings["BETA_WARM_UP"]
-            loss = -(states + settings["GAMMA"] * labels - beta * kl)  # Eq. 4
-            optimizer.param_groups[0]["lr"] = settings["LEARNING_RATE"] * (1 - progress)
+            progress = (epoch - 1 + i / per_epoch) / EPOCHS
+            beta = BETA
+            if progress < BETA_WARM_UP:
+                beta *= progress / BETA_WARM_UP
+            loss = -(states + GAMMA * labels - beta * kl)  # Eq. 4
+            optimizer.param_groups[0]["lr"] = LEARNING_RATE * (1 - progress)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -181,9 +180,9 @@ def train(networks, data, variant, settings):
         if not math.isfinite(loss.item()):
             stop(f"the loss of {variant} is {loss.item()} in epoch {epoch}, and nothing was overwritten; "
                  "lower --learning_rate", code=1)
-        if epoch % 4 == 0 or epoch == epochs:
-            print(f"{epoch:3d}/{epochs}  log p(tau|z) {states:7.3f}  log p(y|z) {labels:7.3f}  KL {kl:6.3f}  "
-                  f"{seconds * (epochs / epoch - 1):4.0f} s left", flush=True)
+        if epoch % 4 == 0 or epoch == EPOCHS:
+            print(f"{epoch:3d}/{EPOCHS}  log p(tau|z) {states:7.3f}  log p(y|z) {labels:7.3f}  KL {kl:6.3f}  "
+                  f"{seconds * (EPOCHS / epoch - 1):4.0f} s left", flush=True)
             save(OUT, "wetvae-checkpoint", variant, SEED, settings, networks=networks.state_dict(),
                  optimizer=optimizer.state_dict(), rng=torch.get_rng_state(), epoch=epoch, seconds=seconds)
     return seconds
@@ -210,8 +209,8 @@ def check_factors(decoder, names, steps):
 @torch.no_grad()
 def find_relation(decoder, names, steps):
     """Alg. 1, "Test: find relation functions": for each factor of z_multi the weight with which single steps
-    and the relation function (common.next_skill) come nearest to the decoder's free run of `steps`. Returns
-    {factor: weight} and prints how far the two are apart (RMS, as a share of the RMS step)."""
+    and the relation function (common.next_skill) come nearest to the decoder's free run of `steps` (RMS, as
+    a share of the RMS step). Returns {factor: weight}."""
     grid, relation = torch.linspace(-Z_RANGE, Z_RANGE, 13), {}
     for factor in [name for name in names if MULTI.get(name) in names]:
         z = torch.zeros(len(grid) ** 2, len(names))  # direction 0: a turn stays within the data's directions
@@ -227,28 +226,28 @@ def find_relation(decoder, names, steps):
     return relation
 
 
-def weak_supervision(dataset, x, settings, key):
+def weak_supervision(dataset, x, key):
     """The factors of interest {name: (low, high)}, in the order of z in all stages, and the classes of their
-    labels (N, M). Exits with 2 if the settings of model `key` do not fit the data."""
+    labels (N, M). Exits with 2 if the constants of model `key` do not fit the data."""
     truth = dict(zip(dataset["names"].tolist(), dataset["factors"].T.astype(np.float64)))
     ranges = dict(zip(truth, dataset["ranges"].tolist()))
     if x.shape[2] == 2:
         truth |= factors_of(x.double().numpy(), ["x", "y"])
         ranges |= dict.fromkeys(("x", "y"), [-ranges["speed"][1], ranges["speed"][1]])
-    asked = settings["LABELS"].split()
+    asked = LABELS.split()
     if not asked or set(asked) - set(truth):
-        stop(f"--labels {settings['LABELS']!r} must be factors of the data set {DATA!r}: {' '.join(truth)}")
+        stop(f"--labels {LABELS!r} must be factors of the data set {DATA!r}: {' '.join(truth)}")
     ranges = {name: ranges[name] for name in truth if name in asked}
-    if len(x) < settings["BATCH"]:
-        stop(f"data set {DATA!r}: {len(x)} trajectories are fewer than --batch {settings['BATCH']}")
+    if len(x) < BATCH:
+        stop(f"data set {DATA!r}: {len(x)} trajectories are fewer than --batch {BATCH}")
     circle = np.ptp(ranges.get("direction", [0])) > 6.28
-    if settings["CIRCLE"] and not (circle and settings["LABELLED"] and settings["OWN_AXIS"]):
+    if CIRCLE and not (circle and LABELLED and OWN_AXIS):
         stop(f"model {key!r}: --circle true needs data of the full circle, direction in --labels, "
              "--labelled true and --own_axis true")
     y = weak_labels(truth, list(ranges), ranges)
     for m, name in enumerate(ranges):
         counts = np.bincount(y[:, m], minlength=common.CLASSES[name])
-        if settings["LABELLED"] and counts.min() < 0.005 * len(y):
+        if LABELLED and counts.min() < 0.005 * len(y):
             stop(f"label {name}: {counts.min()} of {len(y)} trajectories are of class {counts.argmin() + 1}; "
                  f"leave {name} out of --labels, or make other data with 01_make_dataset.py")
     return ranges, torch.from_numpy(y)
@@ -270,24 +269,27 @@ def main():
     if TRAIN:
         dataset = load(OUT, "dataset", DATA, DATA_SEED)
         x = torch.from_numpy(np.diff(dataset["trajectories"], axis=1))  # displacements, App. A.1.2
-        supervision = {key: weak_supervision(dataset, x, models[key], key) for key in models}
+        supervision = {}
+        for key, settings in models.items():
+            globals().update(settings)
+            supervision[key] = weak_supervision(dataset, x, key)
 
     trained = {}
     for key, settings in models.items():
-        variant = f"{EXPERIMENT}_{key}".strip("_")
-        weights = "beta {BETA:g}, gamma {GAMMA:g}".format(**settings)
+        globals().update(settings)  # the constants of this model
+        variant, weights = f"{EXPERIMENT}_{key}".strip("_"), f"beta {BETA:g}, gamma {GAMMA:g}"
         if TRAIN:
             ranges, y = supervision[key]
             names = list(ranges)
-            labels = names if settings["LABELLED"] else []
+            labels = names if LABELLED else []
             print(f"\n{variant}, seed {SEED}, {weights}")
             torch.manual_seed(SEED)
             one_hot = [F.one_hot(y[:, m], common.CLASSES[name]).float() for m, name in enumerate(labels)]
             one_hot = torch.cat([torch.zeros(len(x), 0), *one_hot], 1)
-            circle = names.index("direction") if settings["CIRCLE"] else None
-            encoder = Encoder(x.shape[2], one_hot.shape[1], len(names), settings["HIDDEN"], circle)
-            decoder = Decoder(len(names), x.shape[2], settings["HIDDEN"], circle)
-            heads = LabelDecoders(labels, len(names), settings["HIDDEN"], circle, settings["OWN_AXIS"])
+            circle = names.index("direction") if CIRCLE else None
+            encoder = Encoder(x.shape[2], one_hot.shape[1], len(names), HIDDEN, circle)
+            decoder = Decoder(len(names), x.shape[2], HIDDEN, circle)
+            heads = LabelDecoders(labels, len(names), HIDDEN, circle, OWN_AXIS)
             settings["DATASET"] = hashlib.sha256(x.numpy().tobytes()).hexdigest()  # other data, other model
             seconds = train(nn.ModuleList([encoder, decoder, heads]), (x, one_hot, y), variant, settings)
             abs_corr = check_factors(decoder, names, x.shape[1])  # Alg. 1, "Test"
@@ -297,7 +299,7 @@ def main():
                  names=names, ranges=ranges, relation=relation, length=x.shape[1], seconds=seconds,
                  abs_corr=abs_corr.tolist(), settings=hashlib.sha256(same.encode()).hexdigest()[:8])
         trained[key] = load(OUT, "wetvae", variant, SEED, **settings)
-        kind = f"WET-VAE {key}" if settings["LABELLED"] else "trajectory VAE"
+        kind = f"WET-VAE {key}" if LABELLED else "trajectory VAE"
         trained[key]["title"] = f"{kind}\n{weights}"
         measure(key or EXPERIMENT, trained[key])
     draw_traversals(trained)
@@ -316,7 +318,7 @@ def traverse(decoder, axis, values, steps):
 
 
 def measure(label, model):
-    """Print and save what a model has learnt: a row per factor in results/wetvae.csv."""
+    """Print what a model has learnt, and write a row per factor to results/wetvae.csv."""
     decoder, names, config = model["decoder"], model["names"], model["config"]
     values, reach = np.linspace(-1.5, 1.5, 61), 3.0 if decoder.circle is None else 1.5
     curves = [factors_of(traverse(decoder, i, values, model["length"]), names) for i in range(len(names))]
@@ -345,8 +347,8 @@ def measure(label, model):
 
 
 def draw_traversals(trained):
-    """Fig 4, 10 to 13: a row per axis, a column per (title, model, T). Lines have the colour of the latent's
-    value; where they would hide one another, points have the colour of time and the latent is on y."""
+    """Fig 4, 10 to 13: a row per axis, a column per (title, model, T). Lines have the colour of the latent;
+    where they would hide one another, points have that of time, and the latent is on y."""
     columns = COLUMNS or [(model["title"], key, model["length"]) for key, model in trained.items()]
     names = max((model["names"] for model in trained.values()), key=len)
     heights = [0.5 if name in ("speed", "acceleration") else 1.0 for name in names]

@@ -187,8 +187,8 @@ def test_beta_grows_over_the_first_half_and_the_learning_rate_falls(s2, monkeypa
         return kl * 0, 0, kl
     s2.OUT = str(tmp_path)
     monkeypatch.setattr(s2, "objective", objective)
-    settings = dict(EPOCHS=2, BATCH=2, LEARNING_RATE=1e-3, BETA=8.0, BETA_WARM_UP=0.5, GAMMA=1.0)
-    s2.train(torch.nn.ModuleList([weight]), (torch.zeros(8, 1),), "x", settings)
+    vars(s2).update(EPOCHS=2, BATCH=2, LEARNING_RATE=1e-3, BETA=8.0, BETA_WARM_UP=0.5, GAMMA=1.0)
+    s2.train(torch.nn.ModuleList([weight]), (torch.zeros(8, 1),), "x", {})
     assert betas == pytest.approx([0, 2, 4, 6, 8, 8, 8, 8])
     state = torch.load(tmp_path / "wetvae-checkpoint_x_seed0.pt", weights_only=True)
     assert state["optimizer"]["param_groups"][0]["lr"] == pytest.approx(1e-3 / 8)  # of the last of 8 updates
