@@ -1,7 +1,7 @@
 """Stage 1: factors -> trajectories (App. A.1.1, Table 1, Fig 9).
 
 Draws the factors of interest (speed, direction, curvature; in other experiments acceleration) and makes of
-each draw a trajectory of T transitions from the origin. No robot takes part.
+each draw a trajectory of T transitions from the origin.
 In: nothing. Out, below runs/: a figure, and dataset_<experiment>_seed<seed>.npz with trajectories (N, T + 1,
 2 or 1), factors (N, M), their names (M,) and ranges (M, 2), angles in radians. Takes 5 seconds.
 Expect, n = 100,000: a mean speed of 0.50, and 20 % of the trajectories straight.
@@ -28,7 +28,7 @@ CURVATURE = 30.0        # curvature ~ U(-CURVATURE, CURVATURE), degrees per tran
 ACCELERATION = 0.2      # acceleration ~ U(-ACCELERATION, ACCELERATION) times the speed per transition
 STRAIGHT = 0.2          # probability that the curvature is exactly 0; ours: the same for the acceleration
 
-EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
+EXPERIMENTS = {  # a row names the constants in which an experiment differs
     "main": dict(FIGURE="fig09_dataset"),
     "full": dict(DIRECTION=180.0),                                        # the Ant of Fig 15
     "polar": dict(FACTORS="speed direction", DIRECTION=180.0),            # Fig 11: radius and angle

@@ -25,7 +25,7 @@ EXPERIMENT = "main"    # row of EXPERIMENTS below
 SEED = 0               # random seed
 OUT = "runs"           # folder of all that is written
 TRAIN = True           # false: only measure and draw what is trained already
-RESUME = False         # true: go on from the last checkpoint; there is one every four epochs
+RESUME = False         # true: go on from the last checkpoint
 THREADS = 2            # CPU threads
 
 DATA = "main"          # experiment of 01 to train on
@@ -50,7 +50,7 @@ COLUMNS = []           # columns of its figure: title, model, T ([]: each model,
 # With the beta of the WET-VAE the latents of the trajectory VAE collapse (KL 0.000).
 NONE = dict(LABELLED=False, GAMMA=0.0, BETA=1.0, BETA_WARM_UP=0.0, EPOCHS=24)
 PRINTED = dict(OWN_AXIS=False, BETA_WARM_UP=0.0)  # Eq. 4 as printed; mixes axes with some seeds
-EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
+EXPERIMENTS = {  # a row names the constants in which an experiment differs
     "main": dict(FIGURE="fig04_latent_traversals", MODELS={"": {}, "none": NONE}, COLUMNS=[
         ("(a) WET-VAE, T = 1", "", 1), ("(b) WET-VAE, T = 5", "", 5), ("(c) WET-VAE, T = 10", "", 10),
         ("(d) trajectory VAE, T = 5", "none", 5)]),
@@ -76,7 +76,7 @@ class Encoder(nn.Module):
     def __init__(self, x_dim, y_dim, z_dim, hidden, circle=None):
         super().__init__()
         self.z_dim, self.circle = z_dim, circle
-        self.cell = nn.LSTMCell(x_dim + y_dim, hidden)  # five steps of it are twice as fast as nn.LSTM
+        self.cell = nn.LSTMCell(x_dim + y_dim, hidden)  # in short loops faster than nn.LSTM
         outputs = 2 * z_dim + (circle is not None)
         self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
 
@@ -226,9 +226,10 @@ def find_relation(decoder, names, steps):
     return relation
 
 
-def weak_supervision(dataset, x, key):
+def weak_supervision(dataset, x, key, settings):
     """The factors of interest {name: (low, high)}, in the order of z in all stages, and the classes of their
-    labels (N, M). Exits with 2 if the constants of model `key` do not fit the data."""
+    labels (N, M). Exits with 2 if the settings of model `key` do not fit the data."""
+    globals().update(settings)
     truth = dict(zip(dataset["names"].tolist(), dataset["factors"].T.astype(np.float64)))
     ranges = dict(zip(truth, dataset["ranges"].tolist()))
     if x.shape[2] == 2:
@@ -269,10 +270,7 @@ def main():
     if TRAIN:
         dataset = load(OUT, "dataset", DATA, DATA_SEED)
         x = torch.from_numpy(np.diff(dataset["trajectories"], axis=1))  # displacements, App. A.1.2
-        supervision = {}
-        for key, settings in models.items():
-            globals().update(settings)
-            supervision[key] = weak_supervision(dataset, x, key)
+        supervision = {key: weak_supervision(dataset, x, key, models[key]) for key in models}
 
     trained = {}
     for key, settings in models.items():
@@ -319,29 +317,25 @@ def traverse(decoder, axis, values, steps):
 
 def measure(label, model):
     """Print what a model has learnt, and write a row per factor to results/wetvae.csv."""
-    decoder, names, config = model["decoder"], model["names"], model["config"]
+    decoder, names = model["decoder"], model["names"]
     values, reach = np.linspace(-1.5, 1.5, 61), 3.0 if decoder.circle is None else 1.5
     curves = [factors_of(traverse(decoder, i, values, model["length"]), names) for i in range(len(names))]
     (C, purity), rows = cross_talk(curves, model["ranges"]), []
     same = dict(experiment=EXPERIMENT, seed=SEED, labels=label)
-    print(f"axis: cross-talk with {' '.join(names)}; purity, |corr|, decoded factor for z in [-1.5, 1.5]")
     for i, name in enumerate(names):
         curve = np.degrees(curves[i][name]) if name in ("direction", "curvature") else curves[i][name]
-        pure, corr, gap = purity[i], model["abs_corr"][i], ""
-        text = f"z_{name:12s} {' '.join(f'{c:5.2f}' for c in C[i])}   {pure:.3f}   {corr:.3f}"
-        text = text.replace("nan", "-") + f"   {curve.min():7.2f} .. {curve.max():.2f}"
+        row = dict(factor=name, abs_corr=model["abs_corr"][i], purity=purity[i],
+                   crosstalk=", ".join(f"{other} {c:.2f}" for other, c in zip(names, C[i])),
+                   range_low=curve.min(), range_high=curve.max(), largest_gap_deg="")
         if name == "direction" and np.ptp(model["ranges"][name]) > 6.28:  # empty angles, App. A.3.1
             first = traverse(decoder, i, np.linspace(-reach, reach, 3001), 1)  # a circle closes at 1.5
             first = first[np.linalg.norm(first[:, 0], axis=1) > 0.1]
-            gap = 360 - math.degrees(spread(factors_of(first, [name])[name], name)) if len(first) else 360.0
-            text += f"   largest empty angle {gap:.1f} degrees"
-        if corr < 0.5 or math.isnan(pure):
-            text += f"   no latent means {name}: do not use z_{name}"
-        print(text)
-        rows.append(same | dict(
-            beta=config["BETA"], gamma=config["GAMMA"], factor=name, abs_corr=corr, purity=pure,
-            crosstalk=", ".join(f"{other} {c:.2f}" for other, c in zip(names, C[i])),
-            range_low=curve.min(), range_high=curve.max(), largest_gap_deg=gap,
+            if len(first):
+                row["largest_gap_deg"] = 360 - math.degrees(spread(factors_of(first, [name])[name], name))
+        print(*(f"{k} {v:.2f}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()), sep="  ")
+        if row["abs_corr"] < 0.5 or math.isnan(purity[i]):
+            print(f"no latent means {name}: do not use z_{name}")
+        rows.append(same | dict(beta=BETA, gamma=GAMMA) | row | dict(
             train_seconds=round(model["seconds"]), settings=model["settings"]))
     update_csv(Path(OUT) / "results" / "wetvae.csv", rows, (*same, "factor"))
 

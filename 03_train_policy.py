@@ -26,7 +26,7 @@ SEED = 0                 # random seed
 OUT = "runs"             # folder that everything is written to
 TRAIN = True             # false: only measure and draw what is already trained
 RESUME = False           # true: continue from the last checkpoint
-THREADS = 2              # CPU threads; 1: updates begin after the robots' step, with the same result
+THREADS = 2              # CPU threads; 1: updates wait for the robots' step, with the same result
 REPORTS = 20             # printed lines, points of the learning curve, and checkpoints
 
 METHOD = "wedis"         # wedis, dads or sectar
@@ -39,20 +39,20 @@ BASE_FRAME = True        # networks read state and command in the base frame (th
 
 UPDATES = 100_000        # updates of the critics (the paper: 1.92 million)
 ROBOTS = 256             # robots that step together
-EPISODE = 200            # steps until a robot starts anew; not terminal: the value beyond is bootstrapped
+EPISODE = 200            # steps until a robot starts anew; no terminal state: the value goes on
 SKILL_STEPS = 25         # steps until a robot is given a new skill
 WARM_UP = 10_000         # steps with random actions; their statistics normalise the state
-REPLAY = 1_000_000       # size of the replay buffer R, steps; raised, if need be, to two skills of all robots
+REPLAY = 1_000_000       # steps in the replay buffer R; at least two skills of all robots
 UPDATES_PER_STEP = 8     # updates in each step of all robots
 BATCH = 256              # App. A.1.3
 RELABELLED = 0.5         # share of a batch that is relabelled with a fresh skill (the paper: 0)
 CORRECTED = 0.25         # share of skills with a random correction, as the closed loop adds it (the paper: 0)
 
-HIDDEN = 256             # width of the two hidden layers (the paper: 512)
+HIDDEN = 256             # width of both hidden layers (the paper: 512)
 LEARNING_RATE = 1e-3     # Adam (the paper: 3e-4, fixed)
-DECAY_FROM = 0.5         # share of the updates after which the learning rate falls linearly to 0
-ACTOR_EVERY = 2          # actor and value network learn once in so many updates of the critics (usual: 1)
-AVERAGED = 0.002         # rate of the running average of the actor's weights, which is the policy (1: actor)
+DECAY_FROM = 0.5         # share of the updates after which it falls linearly to 0
+ACTOR_EVERY = 2          # updates of the critics for each of actor and value network (usual: 1)
+AVERAGED = 0.002         # rate of the running average of the actor's weights, which is the policy
 DISCOUNT = 0.98          # gamma of Eq. 1 (the paper: 0.99): a shorter horizon teaches to follow sooner
 SMOOTHING = 0.01         # of the target value network, App. A.1.3
 REWARD_SCALE = 0.1       # of Eq. 6 (the paper: 1)
@@ -63,30 +63,30 @@ FLOOR_END = 0.01         # the same from 60 % of the updates on; it shrinks afte
 # Baselines only
 Z_DIM = 2                # entries of z: DADS 2, SeCTAR 8
 RECENT = 40_000          # latest steps that a baseline's model learns from
-MODEL_BATCH = 256        # steps (DADS) or trajectories (SeCTAR) in a batch of theirs
+MODEL_BATCH = 256        # steps (DADS), trajectories (SeCTAR) in a batch
 PRIOR_SAMPLES = 100      # L of DADS's reward
-EXPLORE = 0.5            # SeCTAR: share of trajectories that are the explorer's (0.0: no explorer)
-EXPLORER = 3.0           # the last entry of its z, and the length of its commands: far beyond N(0, I)
+EXPLORE = 0.5            # SeCTAR: share of trajectories of the explorer (0.0: no explorer)
+EXPLORER = 3.0           # its last entry of z, and length of its commands: far beyond N(0, I)
 KL_WEIGHT = 2.0          # SeCTAR: of the KL divergence in its ELBO
 
 # Measuring only: never an obstacle to --resume
 Z_RANGE = 1.5            # the axes of z are measured from -Z_RANGE to Z_RANGE
-SINGLE_RUN = (1, 100)    # T and H_z of the tracking error, and of Fig 5 for axes of z_single, Sec. 6.1.2
-MULTI_RUN = (5, 40)      # T and H_z of the following error and of purity, and of Fig 5 for axes of z_multi
+SINGLE_RUN = (1, 100)    # T and H_z of the tracking error and of Fig 5 for z_single, Sec. 6.1.2
+MULTI_RUN = (5, 40)      # T and H_z of the following error, of purity and of Fig 5 for z_multi
 TRAVERSAL = 13           # skills on each axis at which purity is measured
-NOISY = 16               # noisy starts over which an executed skill is averaged for its purity
+NOISY = 16               # noisy starts that are averaged for purity
 STARTS = 400             # noisy starts of the following error
 FIGURE = ""              # name of the figure of skills ("": skills_<experiment>)
 
 SECTAR = dict(METHOD="sectar", UPDATES=66_000, Z_DIM=8, SKILL_STEPS=50, RECENT=512_000, MODEL_BATCH=128,
               REWARD_SCALE=1.0, SINGLE_RUN=(50, 1), MULTI_RUN=(50, 1))  # as many minutes as WEDIS
-EXPERIMENTS = {  # a row names the constants in which an experiment differs from the ones above
+EXPERIMENTS = {  # a row names the constants in which an experiment differs
     "ant_semi": dict(FIGURE="fig05_skills_wedis"),
     "ant_full": dict(DECODER="full_circle", FIGURE="fig15_full_circle"),
     "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, BASE_FRAME=False,
                          VARIANCE_SCALE=0.05, ROBOTS=64, SKILL_STEPS=100, CORRECTED=0.5, DISCOUNT=0.97,
                          Z_RANGE=1.0, MULTI_RUN=(6, 20), FIGURE="fig16_half_cheetah"),
-    "ant_world_frame": dict(BASE_FRAME=False),  # the paper's networks: what the base frame is good for
+    "ant_world_frame": dict(BASE_FRAME=False),  # as in the paper: what the base frame is good for
     "ant_dads": dict(METHOD="dads", Z_RANGE=1.0, SKILL_STEPS=200, FIGURE="fig05_skills_dads"),
     "ant_sectar": SECTAR | dict(FIGURE="fig05_skills_sectar"),
     "ant_sectar_no_explorer": SECTAR | dict(EXPLORE=0.0),  # what the explorer is good for
@@ -136,15 +136,9 @@ class Sac(nn.Module):
         self.actor.s_std.copy_(x.std(0).clamp(min=1e-3))
         self.average.load_state_dict(self.actor.state_dict())
 
-    def schedule(self, progress):
-        """Set the learning rate for a share of training that is done (0 to 1)."""
-        rate = LEARNING_RATE * min(1, (1 - progress) / max(1 - DECAY_FROM, 1e-9))
-        for group in self.critic_adam.param_groups + self.actor_adam.param_groups:
-            group["lr"] = rate
-
     def update(self, x, a, x2, r):
-        """One update. x, x2 (B, n): Actor.inputs before and after the step; a (B, m); r (B,). No step is
-        terminal: the time limit is no end of the task. Returns a loss, to detect nan."""
+        """One update; no step is terminal. x, x2 (B, n): Actor.inputs before and after the step; a (B, m);
+        r (B,). Returns a loss, to detect nan."""
         with torch.no_grad():
             q_target = r + DISCOUNT * self.target(x2).squeeze(1)
         q_loss = 0.5 * ((self.critics(x, a) - q_target) ** 2).mean(1).sum()
@@ -219,8 +213,7 @@ class Run:
     """What the three loops share: robots, replay buffer, SAC, clock, reports and checkpoints."""
 
     def __init__(self, decoder, names, z_dim, c_dim, fixed, model=None):
-        self.decoder, self.names = decoder, names
-        self.fixed = fixed  # what a checkpoint must agree with
+        self.decoder, self.names, self.fixed = decoder, names, fixed  # fixed: as in a checkpoint
         self.rng = np.random.default_rng(SEED)
         self.robots = make_robots(ROBOTS, 1)
         self.robots.reset(np.arange(ROBOTS), self.rng)
@@ -275,7 +268,9 @@ class Run:
 
     def learn(self, s, a, s2, c, c2, r):
         """SAC updates, one for each BATCH of steps; c, c2: the commands before and after."""
-        self.sac.schedule(self.sac.updates / UPDATES)
+        left = 1 - self.sac.updates / UPDATES
+        for group in self.sac.critic_adam.param_groups + self.sac.actor_adam.param_groups:
+            group["lr"] = LEARNING_RATE * min(1, left / max(1 - DECAY_FROM, 1e-9))
         x, x2 = self.sac.actor.inputs(s, c), self.sac.actor.inputs(s2, c2)
         for batch in zip(*(part.split(BATCH) for part in (x, a, x2, r))):
             loss = self.sac.update(*batch)
@@ -294,7 +289,7 @@ class Run:
         self.seconds += time.time() - self.clock
         if not all(math.isfinite(value) for value in self.losses.values()):
             stop(f"a loss is not finite after {self.sac.updates} updates: {self.losses}; lower "
-                 "--learning_rate; --resume true goes on from the last good checkpoint", code=1)
+                 "--learning_rate, or --resume true from the last good checkpoint", code=1)
         reported = self.curve[-1]["updates"] if self.curve else 0
         if self.sac.updates >= min(UPDATES, reported + UPDATES / REPORTS):
             self.report()
@@ -321,7 +316,7 @@ class Run:
 
     def resume(self):
         if not (Path(OUT) / artifact_name("policy-checkpoint", EXPERIMENT, SEED)).exists():
-            return print("there is no checkpoint yet: training from the beginning")
+            return print("there is no checkpoint yet")
         state = load(OUT, "policy-checkpoint", EXPERIMENT, SEED, **self.fixed)
         for part, saved in zip(self.parts, state["parts"]):
             part.load_state_dict(saved)
@@ -344,7 +339,7 @@ def main():
     check_constants(source)
     torch.manual_seed(SEED)
     if TRAIN:
-        shared = fixed | dict(DECODER_SHA256=source["sha256"])  # with a checkpoint
+        shared = fixed | dict(DECODER_SHA256=source["sha256"])
         if METHOD == "wedis":
             m1 = sum(name in SINGLE for name in names)
             run = Run(decoder, names, m1 + decoder.x_dim, decoder.x_dim, shared)
@@ -365,18 +360,18 @@ def main():
 
 
 def check_constants(source):
-    """Exits with 2 if constants do not fit together, or to the decoder of 02."""
+    """Exits with 2 if constants do not fit one another, or the decoder."""
     decoder, names = source["decoder"], source["names"]
     if METHOD not in ("wedis", "dads", "sectar") or ROBOT not in ("ant", "half_cheetah"):
         stop("--method is wedis, dads or sectar; --robot is ant or half_cheetah")
     if ROBOT != "ant" and (BASE_FRAME or METHOD != "wedis"):
-        stop(f"the {ROBOT} runs on a rail: --base_frame false; DADS and SeCTAR learn with --robot ant alone")
+        stop(f"the {ROBOT} runs on a rail: --base_frame false; DADS and SeCTAR need --robot ant")
     if METHOD == "sectar" and Z_DIM < 3 or METHOD == "dads" and BASE_FRAME and Z_DIM != 2:
         stop("SeCTAR's --z_dim is at least 3; DADS needs --z_dim 2, or --base_frame false")
     known = names[0] == "speed" and all(name in SINGLE or MULTI.get(name) in names for name in names)
     if not known or decoder.x_dim != make_robots(1, 1).places:
-        stop(f"the decoder {DECODER} has axes {' '.join(names)} and predicts {decoder.x_dim} coordinates, "
-             f"which does not fit the {ROBOT}: choose another --decoder or --robot")
+        stop(f"the decoder {DECODER} has axes {' '.join(names)} and predicts {decoder.x_dim} coordinates: "
+             f"the {ROBOT} needs another --decoder")
     if weak := [name for name, corr in zip(names, source["abs_corr"]) if corr < 0.5]:
         print(f"the decoder {DECODER} has no latent that means {' or '.join(weak)}")
     rates = LEARNING_RATE, AVERAGED, SMOOTHING
@@ -412,7 +407,7 @@ def train_dads(run):
         run.renew(torch.rand(ROBOTS, Z_DIM) * 2 - 1)
         run.act(run.z)
         if run.warm():
-            # from recent steps and their own skills: from relabelled ones q learns that z means nothing
+            # from recent steps and their own skills: relabelled ones say nothing about z
             _, _, _, displacement, z = run.sample(MODEL_BATCH, RECENT)
             loss = -log_q(displacement, z).mean()
             run.adam.zero_grad()
@@ -430,7 +425,7 @@ def train_dads(run):
 def train_sectar(run):
     """Co-Reyes et al. 2018: skills z ~ N(0, I); a VAE learns from the trajectories of an explorer, the same
     policy with very long commands. Reward: of a skill, minus the distance between its end and the decoder's;
-    of the explorer, how much farther along its command it comes than what the VAE makes of its trajectory."""
+    of the explorer, how much farther along its command it comes than the VAE's version of it."""
     encoder, decoder = run.model["encoder"], run.decoder
 
     def elbo(x):
@@ -480,7 +475,7 @@ def train_sectar(run):
             z[fresh] = torch.randn(int(fresh.sum()), Z_DIM)
             with torch.no_grad():
                 decoded = torch.where(explorer[:, None, None], elbo(x)[2], decoder(z, SKILL_STEPS)[0])
-            # Laplace likelihood of the end. The trap: that of single steps is highest for standing still
+            # Laplace likelihood of the end. The trap: that of steps is highest for standing still
             error = x - decoded
             direction = torch.where(explorer[:, None], z[:, :2], -error.sum(1))
             r = REWARD_SCALE * (error * nn.functional.normalize(direction)[:, None]).sum(2)
@@ -511,8 +506,8 @@ def traversal(policy, axis, values):
 
 
 def grid(policy):
-    """Skills of the tracking error, z_multi = 0: 5 speeds x 5 directions (full circle: 16; on a rail: 8
-    speeds), DADS 5 x 5, SeCTAR 25 fixed draws from the prior."""
+    """Skills of the tracking error, z_multi = 0: 5 speeds x 5 directions (full circle: 16; rail: 8 speeds);
+    SeCTAR: 25 draws from the prior."""
     if METHOD == "sectar":
         return torch.randn(25, Z_DIM, generator=torch.Generator().manual_seed(0))
     z = torch.linspace(-Z_RANGE, Z_RANGE, 8)[:, None]
@@ -587,8 +582,7 @@ def executed_cross_talk(policy, ranges, closed):
 
 
 def measure(policy, ranges):
-    """Print and write one row of results/policies.csv. tracking_error: open loop; other columns: closed
-    loop, with _open as in the paper."""
+    """Print and write a row of results/policies.csv. tracking_error, .._open: open loop; others: closed."""
     row = dict(experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy.updates,
                env_steps=policy.env_steps, threads=policy.config["THREADS"],
                train_minutes=policy.seconds / 60, tracking_error=tracking(policy, False))
@@ -604,8 +598,8 @@ def measure(policy, ranges):
 
 
 def draw_skills(policy):
-    """Fig 5, 15, 16: predicted and executed skills, open and (WEDIS) closed loop, a column per axis. On a
-    rail the latent is on the y axis, and transitions have colours."""
+    """Fig 5, 15, 16: predicted and executed skills, a column per axis. On a rail the latent is on the y axis,
+    and transitions have colours."""
     names = policy.names or [str(i + 1) for i in range(Z_DIM)]
     rows = ("predicted", "executed, open loop", "executed, closed loop")[:2 + bool(policy.names)]
     rail = policy.decoder.x_dim == 1
@@ -614,7 +608,7 @@ def draw_skills(policy):
     for i, name in enumerate(names):
         run = MULTI_RUN if rail or name in MULTI else SINGLE_RUN
         values = np.linspace(-1, 1, 9 if rail else 5)
-        colours = ["#D55E00", "#009E73", "#0072B2", "#56B4E9", "#F0E442"]  # the paper's, for the colour-blind
+        colours = ["#D55E00", "#009E73", "#0072B2", "#56B4E9", "#F0E442"]  # as the paper's
         if name == "direction" and policy.decoder.circle is not None:
             values = np.linspace(-1.5, 1.5, 17)[:-1]
             colours = plt.get_cmap("twilight")(np.linspace(0.1, 0.9, 16))
@@ -627,15 +621,11 @@ def draw_skills(policy):
                 for t, colour in enumerate(plt.get_cmap("plasma")(np.linspace(0, 0.85, marks.shape[1]))):
                     ax.plot(marks[:, t, 0], values, ".", color=colour, label=f"t = {t}")
                 continue
-            ax.set_aspect("equal")
             for line, dots, value, colour in zip(path, marks, values, colours):
                 ax.plot(*line.T, color=colour, lw=1.3, label=f"{value:g}")
                 ax.plot(*dots.T, "o", ms=3 if len(dots) < 10 else 0, color=colour)
-        if not rail:  # a square, with one scale for the column
-            (x0, x1), (y0, y1) = ax.get_xlim(), ax.get_ylim()
-            reach = max(x1 - x0, y1 - y0) / 2
-            ax.set(xlim=((x0 + x1) / 2 - reach, (x0 + x1) / 2 + reach),
-                   ylim=((y0 + y1) / 2 - reach, (y0 + y1) / 2 + reach))
+        for ax in axes[:, i]:
+            ax.axis("auto" if rail else "square")  # one scale for the column
         axes[0, i].set_title(f"$z_{{{name}}}$, $T$ = {run[0]}, $H_z$ = {run[1]}")
         axes[-1, i].set_xlabel("x (m)")
     for ax, text in zip(axes[:, 0], rows):

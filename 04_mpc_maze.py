@@ -1,8 +1,7 @@
 """Stage 4: decoder + policy -> mazes solved without training in them (Sec. 5, Algorithm 2, Sec. 6.2).
 
 In: policy_<POLICY>_seed<n>.pt of stage 3. Out: <OUT>/results/<EXPERIMENT>.csv, a row per trial, and figures.
-  python 04_mpc_maze.py                          Fig 3, 6, 8, 14, 17 and GIFs, 56 s on two cores
-  python 04_mpc_maze.py --experiment figure7     or another row of EXPERIMENTS below
+  python 04_mpc_maze.py   Fig 3, 6, 8, 14, 17 and GIFs, 56 s on two cores; others: --experiment figure7 ..
 Expect, mean final distance of 3 policies x 50 trials (dense maze 1, 2; sparse maze 1, 2): 4.1, 2.0, 4.7,
 4.8 m as printed; 0.8, 0.5, 3.6, 3.5 m in closed loop. The start is 26.8 m from the goal.
 """
@@ -21,58 +20,57 @@ import numpy as np
 import torch
 from PIL import Image  # comes with matplotlib
 
-EXPERIMENT = "mazes"        # row of EXPERIMENTS below
-SEED = 0                    # random seed of the trials
-OUT = "runs"                # folder that everything is written to
-THREADS = 2                 # CPU threads
+EXPERIMENT = "mazes"      # row of EXPERIMENTS below
+SEED = 0                  # random seed of the trials
+OUT = "runs"              # folder that everything is written to
+THREADS = 2               # CPU threads
 DRAW = "fig03 fig06 fig08 fig14 fig17 gif"  # rows of DRAWINGS below
-DRIVE = False               # true: only serve a page with a slider for each axis of z (drive.py)
-SECONDS = 0.0               # until the page ends by itself; 0: when it is closed
-PORT = 8080                 # of the page, on this machine alone; 0: the first free one
+DRIVE = False             # true: only serve a page with a slider for each axis of z
+SECONDS = 0.0             # until the page ends by itself; 0: when it is closed
+PORT = 8080               # of the page, on this machine alone; 0: the first free one
 
-METHOD = "wedis"            # rows of METHODS below
-MAZES = "maze1 maze2"       # rows of MAZE below
-REWARDS = "dense sparse"    # Sec. 6.2
-MODES = "printed closed"    # Algorithm 2 as printed; ours: closed loop with mean actions
-POLICY = "ant_semi"         # experiment of 03
-POLICY_SEEDS = "0"          # and its seeds
-TRIALS = 50                 # of each configuration (the paper: 10)
+METHOD = "wedis"          # rows of METHODS below
+MAZES = "maze1 maze2"     # rows of MAZE below
+REWARDS = "dense sparse"  # Sec. 6.2
+MODES = "printed closed"  # Algorithm 2 as printed; ours: closed loop with mean actions
+POLICY = "ant_semi"       # experiment of 03
+POLICY_SEEDS = "0"        # and its seeds
+TRIALS = 50               # of each configuration (the paper: 10)
 
 # Table 2, the row of WEDIS
-EPISODE = 600               # H_E, environment steps
-HOLD = 40                   # H_z, environment steps for which z_single is held
-LENGTH = 5                  # T, transitions of a skill
-PLANNED = 3                 # H_P, skills planned ahead, dense reward; sparse: to the end of the episode
-Z_RANGE = 1.5               # skills ~ U(-Z_RANGE, Z_RANGE), but speed ~ U(0, Z_RANGE): slow is useless here
+EPISODE = 600             # H_E, environment steps
+HOLD = 40                 # H_z, environment steps for which z_single is held
+LENGTH = 5                # T, transitions of a skill
+PLANNED = 3               # H_P, skills planned ahead, dense reward; sparse: to the end of the episode
+Z_RANGE = 1.5             # skills ~ U(-Z_RANGE, Z_RANGE), but speed ~ U(0, Z_RANGE)
 
 # Planning, App. A.1.4
-SAMPLES = "1000"            # N, sequences of skills per plan; one or more numbers
-LOOK_AHEAD = ""             # steps to plan ahead, one or more numbers ("": Table 2's H_P)
-POOL = 65536                # skills, decoded once, that plans draw from (the paper: no pool)
-PENALTY = 100.0             # w_p, for each transition of a plan that collides
-REWARD_WEIGHT = 5.0         # w_r, sparse reward
-EPSILON = 5.0               # epsilon, metres: acceptable error; a trial that ends nearer is a success
-RADIUS = 1.0                # metres by which the planner grows the walls: the reach of the Ant's legs
-GOAL = (24.0, 12.0)         # x and y, metres; the Ant starts at (0, 0), 26.8 m away, 36 m along the axes
+SAMPLES = "1000"          # N, sequences of skills per plan; one or more numbers
+LOOK_AHEAD = ""           # steps to plan ahead, one or more numbers ("": Table 2's H_P)
+POOL = 65536              # skills, decoded once, that plans draw from (the paper: no pool)
+PENALTY = 100.0           # w_p, for each transition of a plan that collides
+REWARD_WEIGHT = 5.0       # w_r, sparse reward
+EPSILON = 5.0             # epsilon, metres: acceptable error; who ends nearer succeeds
+RADIUS = 1.0              # metres by which the planner grows the walls: the Ant's legs
+GOAL = (24.0, 12.0)       # metres; the Ant starts at (0, 0), 26.8 m away
 
 METHODS = {  # Table 2. The later wins: the file, EXPERIMENTS, MAZE, METHODS, flags
     "wedis": {},
-    "wedis_s": dict(MODES="printed", LENGTH=1, PLANNED=4),            # single steps
+    "wedis_s": dict(MODES="printed", LENGTH=1, PLANNED=4),  # single steps
     "wedis_nts": dict(MODES="printed", HOLD=1, LENGTH=20, PLANNED=4),  # no trajectory scaling
     # App. A.1.4 gives DADS U(-1, 1), as it is trained, and SeCTAR U(-1.5, 1.5); Table 2 swaps the two.
     "dads": dict(MODES="printed", POLICY="ant_dads", POLICY_SEEDS="0 1", EPISODE=300, HOLD=20, LENGTH=1,
                  PLANNED=4, Z_RANGE=1.0),
     "sectar": dict(MODES="printed", POLICY="ant_sectar", POLICY_SEEDS="0 1", HOLD=1, LENGTH=40, PLANNED=4),
 }
+STUDY = dict(METHOD=" ".join(METHODS), POLICY_SEEDS="0 1 2", TRIALS=20)
 EXPERIMENTS = {  # a row names the constants in which an experiment differs; its name is that of its CSV
     "mazes": {},
-    "figure7": dict(METHOD=" ".join(METHODS), POLICY_SEEDS="0 1 2", TRIALS=20, DRAW="fig07",
-                    SAMPLES="10 30 100 300 1000 3000"),  # stopped and started again, it resumes
+    "figure7": STUDY | dict(DRAW="fig07", SAMPLES="10 30 100 300 1000 3000"),  # it resumes
     "fig18": dict(MAZES="s_maze obstacles", REWARDS="dense", MODES="closed", POLICY_SEEDS="0 1 2",
                   DRAW="fig18"),  # 30 s
     "drive": dict(DRIVE=True, MAZES="open", MODES="closed"),
-    "matched": dict(METHOD=" ".join(METHODS), POLICY_SEEDS="0 1 2", TRIALS=20, DRAW="",
-                    LOOK_AHEAD="200 600"),  # all methods look equally far ahead
+    "matched": STUDY | dict(DRAW="", LOOK_AHEAD="200 600"),  # all methods look equally far ahead
 }
 HULL = [(-7, -6, -7, 19), (31, 32, -7, 19), (-7, 32, -7, -6), (-7, 32, 18, 19)]  # x0, x1, y0, y1, metres
 MAZE = {  # walls, and the constants in which a maze differs; plan a row of your own with --mazes <its name>
@@ -113,7 +111,7 @@ def scaled_path(state, delta, scale):
 
 def reward(path, u, kind):
     """Planning reward r_d or r_s, Sec. 6.2, of paths (N, K + 1, 2), metres -> (N,): the task reward of the
-    last state (the paper does not say which) less w_p for each transition that collides."""
+    last state less w_p for each transition that collides."""
     distance = (path[:, -1] - torch.tensor(u.goal)).norm(dim=1)  # -r(s)
     penalty = u.penalty * collides(path, u.walls, u.radius).sum(1)
     if kind == "sparse":
@@ -125,15 +123,15 @@ def plan(u, kind, samples, horizon, pool, s0):
     """Algorithm 2, lines 2 to 12: the best of `samples` (N) random sequences of `horizon` (H_P) skills from
     s0 (2,), metres. Returns its first skill z (M,) and its path (H_P T + 1, 2)."""
     z, delta = pool
-    state = s0.expand(samples, 1, 2)                                        # line 2
-    picked = torch.randint(len(z), (samples, horizon))                      # line 3
+    state = s0.expand(samples, 1, 2)  # line 2
+    picked = torch.randint(len(z), (samples, horizon))  # line 3
     path = [state]
-    for j in range(horizon):                                                # line 4
-        delta_j = delta[picked[:, j]]                                       # lines 5 and 6
-        path.append(scaled_path(state, delta_j, u.policy.scale * u.hold))   # line 7
-        state = path[-1][:, -1:]                                            # line 8
+    for j in range(horizon):  # line 4
+        delta_j = delta[picked[:, j]]  # lines 5 and 6
+        path.append(scaled_path(state, delta_j, u.policy.scale * u.hold))  # line 7
+        state = path[-1][:, -1:]  # line 8
     path = torch.cat(path, 1)
-    best = reward(path, u, kind).argmax()                                   # lines 10 and 11
+    best = reward(path, u, kind).argmax()  # lines 10 and 11
     return z[picked[best, 0]], path[best].clone()  # the trap: a view would keep all N paths in memory
 
 
@@ -156,27 +154,27 @@ def run(u):
     torch.manual_seed(u.seed)
     pool, closed = skill_pool(u), u.mode == "closed"
     poses = [robots.qpos.copy()]
-    for i in range(skills):                                                 # line 1
+    for i in range(skills):  # line 1
         chosen = []
-        for t, s0 in zip(trials, robots.place()):                           # line 20, of the round before
+        for t, s0 in zip(trials, robots.place()):  # line 20, of the round before
             clock = time.perf_counter()
             horizon = min(t.planned, skills - i)  # no plan looks beyond the end of the episode
-            z, path = plan(u, t.reward, t.samples, horizon, pool, s0)       # lines 2 to 12
+            z, path = plan(u, t.reward, t.samples, horizon, pool, s0)  # lines 2 to 12
             t.time += time.perf_counter() - clock
             t.plans.append((len(poses) - 1, path.numpy()))
             chosen.append(z)
-        commands = commands_of(u.policy, torch.stack(chosen), u.length)     # lines 17 and 18
+        commands = commands_of(u.policy, torch.stack(chosen), u.length)  # lines 17 and 18
         for _ in execute(u.policy, robots, commands, u.hold, closed, deterministic=closed):  # lines 13 to 19
             poses.append(robots.qpos.copy())  # for figures
 
     rows = []
     for n, t in enumerate(trials):
         t.poses = np.stack([pose[n] for pose in poses])
-        distance = np.linalg.norm(t.poses[:, :2] - u.goal, axis=1)
+        distance = np.linalg.norm(t.poses[-1, :2] - u.goal)
         rows.append(dict(
             maze=u.maze, reward=t.reward, method=u.method, mode=u.mode, look_ahead=t.planned * skill_steps,
-            samples=t.samples, trial=t.trial, seed=u.seed, final_distance=distance[-1],
-            success=int(distance[-1] < u.epsilon), planning_ms=1e3 * t.time / skills,
+            samples=t.samples, trial=t.trial, seed=u.seed, final_distance=distance,
+            success=int(distance < u.epsilon), planning_ms=1e3 * t.time / skills,
             policy_seed=u.policy_seed, policy=u.policy.sha256[:8], settings=u.settings))
     return rows, [t for t in trials if t.trial < 3]
 
@@ -236,7 +234,7 @@ def collides(path, walls, radius):
 
 # -------- what is planned: rows, flags, checks
 
-# rows of MAZE and METHODS may not set these
+# not for rows of MAZE and METHODS
 OF_A_RUN = "EXPERIMENT OUT THREADS DRAW METHOD MAZES DRIVE SECONDS PORT".split()
 load_once = cache(common.load)
 
@@ -313,8 +311,8 @@ def values_of(rows, column, **where):
 
 
 def resampled_means(values, rng, draws=10_000):
-    """Means (draws,) of values (policies, trials), policies and trials of each drawn with replacement (the
-    hierarchical bootstrap): trials of one policy alone say nothing about the next policy."""
+    """Means (draws,) of values (policies, trials), policies and trials of each drawn with replacement: the
+    hierarchical bootstrap."""
     policies, trials = values.shape
     drawn = rng.integers(policies, size=(draws, policies, 1))
     return values[drawn, rng.integers(trials, size=(draws, policies, trials))].mean((1, 2))
@@ -450,7 +448,7 @@ def draw_fig14(rows, units, examples):
 
 
 def draw_gif(rows, units, examples):
-    """A GIF per maze: trial 0 of its first reward in the last mode. Dots: where the Ant goes."""
+    """A GIF per maze: trial 0 of its first reward in the last mode."""
     firsts = [example for example in examples if (example.trial, example.reward) == (0, example.u.rewards[0])]
     for maze, example in {example.u.maze: example for example in firsts}.items():
         spec = maze_spec(example.u)

@@ -15,7 +15,7 @@ import signal
 import sys
 from pathlib import Path
 
-os.environ["MPLBACKEND"] = "Agg"  # figures are files; a notebook's backend would fail here
+os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend would fail here
 if sys.platform == "linux":  # before mujoco loads: GLFW aborts without a screen
     os.environ.setdefault("MUJOCO_GL", "egl" if ctypes.util.find_library("EGL") else "disable")
 
@@ -27,15 +27,15 @@ from mujoco.batch import Batch
 from torch import nn
 from torch.utils._pytree import tree_leaves
 
-SINGLE = ("speed", "direction")  # factors of z_single, Sec. 4.2.2: they act in each transition
+SINGLE = ("speed", "direction")  # factors of z_single, Sec. 4.2.2
 MULTI = dict(curvature="direction", acceleration="speed")  # factors of z_multi, and what they change in time
 CLASSES = dict(speed=4, direction=4, curvature=3, acceleration=3, x=4, y=4)  # of labels, App. A.1.1, A.3.1
 FRAME_SKIP = 5     # physics steps of 0.01 s per environment step
 FEEDBACK = 0.1     # closed loop: share of the distance to the reference added to a command (the paper: 0)
 CORRECTION = 0.2   # at most so much, trajectory units
-FASTEST = 1.0      # no command is longer, trajectory units: much longer ones than in training make falls
+FASTEST = 1.0      # no command is longer, trajectory units: much longer ones make falls
 SOFT_START = 20    # environment steps over which the longest command grows from 0.2 to FASTEST
-FORMAT = 3         # of the artifacts; raise it when the meaning of what is stored changes
+FORMAT = 3         # of the artifacts; raise it when their meaning changes
 HERE = Path(__file__).resolve().parent
 SCRIPT = {"dataset": "01_make_dataset.py", "wetvae": "02_train_wetvae.py", "policy": "03_train_policy.py"}
 
@@ -78,7 +78,7 @@ def parse_flags(stage, argv=None):
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop("stopped; 02 and 03 go on with --resume true", 1))
     if hasattr(signal, "SIGPIPE"):
-        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # piped into head: end as other programs do
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # piped into head
     parser = argparse.ArgumentParser(description=stage["__doc__"], allow_abbrev=False,
                                      argument_default=argparse.SUPPRESS,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -101,8 +101,6 @@ def parse_flags(stage, argv=None):
     stage.update(rows[experiment] | given)
     config = {name: convert(stage[name], like, "--" + name.lower()) for name, like in likes.items()}
     stage.update(config)
-    if Path(stage["OUT"]).resolve() == HERE:
-        stop("--out is this repository itself; its figures/ and results/ are what is shipped")
     write_whole(Path(stage["OUT"]) / f".can_write_{os.getpid()}", b"").unlink()  # before any work is lost
     return config, {name: config[name] for name in given}
 
@@ -117,11 +115,11 @@ def write_whole(path, data):
         with open(partial, "wb") as file:
             file.write(data)
             file.flush()
-            os.fsync(file.fileno())  # before it takes the name: a power cut leaves no empty artifact
+            os.fsync(file.fileno())  # or a power cut may leave an empty file
         os.replace(partial, path)  # atomic
     except OSError as error:
         stop(f"cannot write {path}: {error.strerror}; free the space or choose another --out", code=1)
-    finally:  # it is there if the disk is full, or if somebody stops the program
+    finally:  # left by a full disk, or by whoever stops the program
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
     return path
@@ -266,7 +264,7 @@ def layers(n_in, hidden, n_out):
 class Decoder(nn.Module):
     """p_theta(tau | z), Fig 1: an LSTM over z and its own last mean -> a Gaussian over the next displacement.
     The trap: a decoder that reads the true last displacement needs no z, and z stays entangled. circle: index
-    of a latent that is an angle, a whole turn from -1.5 to 1.5, the ends of a traversal."""
+    of a latent that is an angle, a whole turn from -1.5 to 1.5."""
 
     def __init__(self, z_dim, x_dim, hidden, circle=None):
         super().__init__()

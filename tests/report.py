@@ -377,12 +377,12 @@ MAP = [  # what, places: script, text to look for
     ("Eq. 4", [("02", "loss = -(states")]),
     ("Alg. 1, first loop", [("02", "def train(")]),
     ("Alg. 1, \"Test: check factors in z\"", [("02", "def check_factors")]),
-    ("Fig 4, 10 to 13", [("02", "def draw_traversals"), ("02", "def measure(")]),
+    ("Fig 4, 10 to 13", [("02", "def draw_traversals")]),
     ("Alg. 1, \"Test: find relation functions\"", [("02", "def find_relation")]),
     ("relation functions, Sec. 4.2.2", [("common", "def next_skill")]),
     ("Alg. 1, second loop", [("03", "def train_wedis")]),
     ("Eq. 5, 6", [("03", "def reward(")]),
-    ("SAC, App. A.1.3", [("03", "class Sac"), ("03", "class Critics"), ("common", "class Actor")]),
+    ("SAC, App. A.1.3", [("03", "class Sac"), ("common", "class Actor")]),
     ("command, base frame (ours)", [("common", "def commands_of"), ("common", "def to_base_frame")]),
     ("Fig 5, 15, 16", [("03", "def draw_skills"), ("03", "def tracking("), ("03", "def following(")]),
     ("DADS, SeCTAR", [("03", "def train_dads"), ("03", "def train_sectar")]),
@@ -392,7 +392,7 @@ MAP = [  # what, places: script, text to look for
     ("closed loop (ours)", [("common", "def closed_loop")]),
     ("r_d, r_s, Sec. 6.2", [("04", "def reward(")]),
     ("Table 2, App. A.1.4", [("04", "METHODS = {"), ("04", "EPISODE =")]),
-    ("Fig 6, 7, 8", [("04", "def draw_fig06"), ("04", "def draw_fig07"), ("04", "def draw_examples")]),
+    ("Fig 7, 8", [("04", "def draw_fig07"), ("04", "def draw_examples")]),
 ]
 FILES = {"01": "01_make_dataset.py", "02": "02_train_wetvae.py", "03": "03_train_policy.py", "04": "04_mpc_maze.py",
          "common": "common.py"}

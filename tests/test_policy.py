@@ -204,9 +204,11 @@ def test_the_actor_waits_for_every_second_update_of_the_critics(s3):
 
 
 def test_the_learning_rate_falls_in_the_second_half(s3):
-    sac, _ = small_sac(s3, 1)
+    sac, (_, a, _, r) = small_sac(s3, 1)
+    s3.UPDATES, run = 1000, SimpleNamespace(sac=sac)
     for progress, rate in ((0, 1), (0.25, 1), (0.5, 1), (0.75, 0.5), (1, 0)):
-        sac.schedule(progress)
+        sac.updates = int(1000 * progress)
+        s3.Run.learn(run, torch.zeros(64, 5), a, torch.zeros(64, 5), torch.zeros(64, 2), torch.zeros(64, 2), r)
         for optimizer in (sac.critic_adam, sac.actor_adam):
             assert optimizer.param_groups[0]["lr"] == pytest.approx(rate * s3.LEARNING_RATE)
 

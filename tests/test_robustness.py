@@ -116,12 +116,6 @@ def test_a_checkpoint_of_another_decoder_is_one_line_and_a_weak_decoder_is_said_
     assert "the decoder main has no latent that means direction" in done.stdout
 
 
-@pytest.mark.parametrize("stage", ["s1", "s2", "s3", "s4"])
-def test_the_repository_itself_is_no_place_for_results(stage, request, inside):
-    done = inside(request.getfixturevalue(stage), "--out", ROOT)
-    assert one_line(done, 2) and "--out is this repository itself" in done.stderr
-
-
 @pytest.mark.parametrize("experiment", ["ant_semi", "ant_dads", "ant_sectar"])
 def test_a_loss_that_is_not_finite_overwrites_nothing(experiment, s3, inside, out):
     flags = [*tiny(out, updates=320), "--experiment", experiment]
