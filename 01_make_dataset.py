@@ -63,8 +63,7 @@ def check(names, limits):
     if "curvature" in names and "direction" not in names:
         stop("--factors with curvature needs direction too: one dimension has no turns")
     if "acceleration" in names and ACCELERATION * (LENGTH - 1) >= 1:
-        stop(f"--acceleration {ACCELERATION:g} ends in reverse after {LENGTH} transitions; "
-             f"it must be less than {1 / (LENGTH - 1):.3g}, or --length smaller")
+        stop(f"--acceleration must be less than {1 / (LENGTH - 1):.3g}, or the last transitions go back")
 
 
 def main():

@@ -43,7 +43,7 @@ BATCH = 512            # trajectories per update (the paper: 2048)
 EPOCHS = 12            # passes over the data (the paper: 300)
 LEARNING_RATE = 2e-3   # of Adam, falls linearly to 0 (the paper: 2e-4, fixed)
 
-Z_RANGE = 1.5          # traversals are drawn, and relation functions found, from -Z_RANGE to Z_RANGE
+Z_RANGE = 1.5          # traversals are drawn (in training: relation functions found) from -Z_RANGE to Z_RANGE
 FIGURE = ""            # name of the figure of traversals ("": traversals_<experiment>)
 MODELS = {"": {}}      # models of an experiment: {end of the file's name: the constants that differ}
 COLUMNS = []           # columns of its figure: title, model, T ([]: each model, at the T of the data)
@@ -65,7 +65,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs
                          BETA=4.0, FIGURE="fig13_four_factors", MODELS={"": {}, "circle": dict(CIRCLE=True)}),
     "full": dict(DATA="full", FIGURE="full_circle_traversals", MODELS={"": {}, "circle": dict(CIRCLE=True)}),
 }
-FREE = {"OUT", "TRAIN", "RESUME", "THREADS", "Z_RANGE", "FIGURE"}  # change no model
+FREE = {"OUT", "TRAIN", "RESUME", "THREADS", "Z_RANGE", "FIGURE"}  # change no network
 
 
 class Encoder(nn.Module):
@@ -95,8 +95,8 @@ class Encoder(nn.Module):
 
 class LabelDecoders(nn.Module):
     """p_theta(y^m | z), the M label decoders of Eq. 4: MLPs over all of z (the paper) or, with own_axis, the
-    logits scale * z^m * order_k + bias_k of classes k. Without an order, left may lie beside right. On a
-    circle, classes lie at their true angles: this fixes direction 0."""
+    logits scale * z^m * order_k + bias_k of classes k. The order right, straight, left keeps straight
+    in the middle. On a circle, classes lie at their true angles: this fixes direction 0."""
 
     def __init__(self, labels, z_dim, hidden, circle, own_axis):
         super().__init__()
@@ -216,7 +216,7 @@ def find_relation(decoder, names, steps):
         z = torch.zeros(len(grid) ** 2, len(names))  # direction 0: a turn stays within the data's directions
         z[:, [0, names.index(factor)]] = torch.cartesian_prod(grid, grid)  # the first axis is the speed
         free, errors = decoder(z, steps)[0], {}
-        for weight in sorted(np.linspace(-1, 1, 401).round(4).tolist(), key=abs):  # of equals the smallest
+        for weight in sorted(np.linspace(-1, 1, 401).round(4).tolist(), key=abs):  # small ones win ties
             skills = SimpleNamespace(method="wedis", decoder=decoder, names=names, relation={factor: weight})
             chain = commands_of(skills, z, steps)
             errors[weight] = ((chain - free).square().mean() / free.square().mean()).sqrt().item()
@@ -258,8 +258,8 @@ def main():
     config, given = parse_flags(globals())
     torch.set_num_threads(THREADS)
     models = {}
-    if not MODELS or {key for _, key, _ in COLUMNS} - set(MODELS):
-        stop(f"COLUMNS shows models that are not in MODELS: {' '.join(MODELS)}")
+    if not MODELS or not all(len(column) == 3 and column[1] in MODELS for column in COLUMNS):
+        stop(f"COLUMNS: each is (title, model, T), with a model of MODELS: {' '.join(MODELS)}")
     for key, changes in MODELS.items():
         for name, value in changes.items():
             if name not in config or name in FREE | {"EXPERIMENT", "SEED", "DATA", "DATA_SEED"}:

@@ -1,8 +1,8 @@
 """Stage 3: decoder -> skill policy pi(a | s, c), trained by SAC on single steps (Sec. 4.2, Alg. 1, A.1.3).
 
-Reads runs/wetvae_*.pt of stage 2. The command c of a skill z_single is the decoder's first displacement. The
-reward is the decoder's log-likelihood of the step that the robot makes (Eq. 6).
-Writes runs/policy_<experiment>_seed<seed>.pt, Fig 5 (15, 16) and a row of runs/results/policies.csv.
+In: wetvae_<DECODER>_seed<n>.pt of stage 2. The command c of a skill z_single is the decoder's first
+displacement. The reward is the decoder's log-likelihood of the step that the robot makes (Eq. 6).
+Out: runs/policy_<experiment>_seed<seed>.pt, Fig 5 (15, 16) and a row of runs/results/policies.csv.
 Takes 12 to 16 minutes on two cores (135 to 112 updates/s). Expect, mean of 3 seeds: tracking error 0.14
 in open loop, 0.04 in closed loop; there, median following error 0.06 m, and 1 % of the robots turn over.
 """
@@ -48,7 +48,7 @@ BATCH = 256              # App. A.1.3
 RELABELLED = 0.5         # share of a batch that is relabelled with a fresh skill (the paper: 0)
 CORRECTED = 0.25         # share of skills with a random correction, as the closed loop adds it (the paper: 0)
 
-HIDDEN = 256             # width of both hidden layers (the paper: 512)
+HIDDEN = 256             # width of both hidden layers (the paper: 512; Half-Cheetah 256)
 LEARNING_RATE = 1e-3     # Adam (the paper: 3e-4, fixed)
 DECAY_FROM = 0.5         # share of the updates after which it falls linearly to 0
 ACTOR_EVERY = 2          # updates of the critics for each of actor and value network (usual: 1)
@@ -66,7 +66,7 @@ RECENT = 40_000          # latest steps that a baseline's model learns from
 MODEL_BATCH = 256        # steps (DADS), trajectories (SeCTAR) in a batch
 PRIOR_SAMPLES = 100      # L of DADS's reward
 EXPLORE = 0.5            # SeCTAR: share of trajectories of the explorer (0.0: no explorer)
-EXPLORER = 3.0           # its last entry of z, and length of its commands: far beyond N(0, I)
+EXPLORER = 3.0           # last entry of an explorer's z, and length of its commands
 KL_WEIGHT = 2.0          # SeCTAR: of the KL divergence in its ELBO
 
 # Measuring only: never an obstacle to --resume
@@ -110,12 +110,12 @@ class Critics(nn.Module):
         h = torch.cat([x, a], 1).expand(2, -1, -1)
         h = torch.relu(torch.baddbmm(self.biases[0], h, self.weights[0]))
         h = torch.relu(torch.baddbmm(self.biases[1], h, self.weights[1]))
-        return (h * self.weights[2].mT).sum(2) + self.biases[2].squeeze(2)  # a matrix product is slower here
+        return (h * self.weights[2].mT).sum(2) + self.biases[2].squeeze(2)
 
 
 class Sac(nn.Module):
     """Actor psi, twin critics, value and target network, with a fixed temperature. average: the policy,
-    a running average of the actor's weights (the actor itself varies between reports)."""
+    a running average of the actor's weights."""
 
     def __init__(self, s_dim, c_dim, a_dim):
         super().__init__()
@@ -213,13 +213,13 @@ class Run:
     """What the three loops share: robots, replay buffer, SAC, clock, reports and checkpoints."""
 
     def __init__(self, decoder, names, z_dim, c_dim, fixed, model=None):
-        self.decoder, self.names, self.fixed = decoder, names, fixed  # fixed: as in a checkpoint
+        self.decoder, self.names, self.fixed = decoder, names, fixed
         self.rng = np.random.default_rng(SEED)
         self.robots = make_robots(ROBOTS, 1)
         self.robots.reset(np.arange(ROBOTS), self.rng)
         s_dim, a_dim = self.robots.observe().shape[1], self.robots.ctrl.shape[1]
         self.sac = Sac(s_dim, c_dim, a_dim)
-        self.parts = [self.sac, self.sac.critic_adam, self.sac.actor_adam]  # of a checkpoint
+        self.parts = [self.sac, self.sac.critic_adam, self.sac.actor_adam]
         if model:  # what else a baseline learns
             self.model = nn.ModuleDict(model)
             self.adam = torch.optim.Adam(self.model.parameters(), lr=LEARNING_RATE, fused=True)
@@ -355,6 +355,8 @@ def main():
              robot=ROBOT, names=names, relation=source["relation"], scale=STEP_SCALE, curve=run.curve,
              updates=run.sac.updates, env_steps=run.steps * ROBOTS, seconds=run.seconds)
     policy = SimpleNamespace(**load(OUT, "policy", EXPERIMENT, SEED, **fixed))
+    if policy.names and not torch.equal(policy.decoder.head[2].bias, source["decoder"].head[2].bias):
+        stop(f"the policy was trained with another decoder {DECODER} than the present one")
     measure(policy, source["ranges"])
     draw_skills(policy)
 
@@ -367,7 +369,7 @@ def check_constants(source):
     if ROBOT != "ant" and (BASE_FRAME or METHOD != "wedis"):
         stop(f"the {ROBOT} runs on a rail: --base_frame false; DADS and SeCTAR need --robot ant")
     if METHOD == "sectar" and Z_DIM < 3 or METHOD == "dads" and BASE_FRAME and Z_DIM != 2:
-        stop("SeCTAR's --z_dim is at least 3; DADS needs --z_dim 2, or --base_frame false")
+        stop("SeCTAR needs --z_dim 3 or more; DADS --z_dim 2, or --base_frame false")
     known = names[0] == "speed" and all(name in SINGLE or MULTI.get(name) in names for name in names)
     if not known or decoder.x_dim != make_robots(1, 1).places:
         stop(f"the decoder {DECODER} has axes {' '.join(names)} and predicts {decoder.x_dim} coordinates: "
@@ -425,7 +427,7 @@ def train_dads(run):
 def train_sectar(run):
     """Co-Reyes et al. 2018: skills z ~ N(0, I); a VAE learns from the trajectories of an explorer, the same
     policy with very long commands. Reward: of a skill, minus the distance between its end and the decoder's;
-    of the explorer, how much farther along its command it comes than the VAE's version of it."""
+    of the explorer, how much farther along its command it ends than the VAE's reconstruction."""
     encoder, decoder = run.model["encoder"], run.decoder
 
     def elbo(x):
@@ -570,14 +572,13 @@ def following(policy, closed):
 
 
 def executed_cross_talk(policy, ranges, closed):
-    """cross_talk of executed skills: of each, five displacements that are means over NOISY starts."""
-    values, curves = np.linspace(-Z_RANGE, Z_RANGE, TRAVERSAL), []
-    every = max(1, MULTI_RUN[0] * MULTI_RUN[1] // 5)
+    """cross_talk of executed skills, a displacement for each transition, the mean of NOISY starts."""
+    values, curves, (length, hold) = np.linspace(-Z_RANGE, Z_RANGE, TRAVERSAL), [], MULTI_RUN
     for axis in range(len(policy.names)):
         z = traversal(policy, axis, values).repeat(NOISY, 1)
-        places = roll_out(policy, z, MULTI_RUN, closed, noise=SEED + 1, run_in=MULTI_RUN[1])[:, ::every]
-        steps = np.diff(places, axis=1).reshape(NOISY, TRAVERSAL, places.shape[1] - 1, -1).mean(0)
-        curves.append(factors_of(steps / (every * policy.scale), list(ranges)))
+        places = roll_out(policy, z, MULTI_RUN, closed, noise=SEED + 1, run_in=hold)[:, ::hold]
+        steps = np.diff(places, axis=1).reshape(NOISY, TRAVERSAL, length, -1).mean(0)
+        curves.append(factors_of(steps / (hold * policy.scale), list(ranges)))
     return cross_talk(curves, ranges)
 
 

@@ -52,7 +52,7 @@ PENALTY = 100.0           # w_p, for each transition of a plan that collides
 REWARD_WEIGHT = 5.0       # w_r, sparse reward
 EPSILON = 5.0             # epsilon, metres: acceptable error; who ends nearer succeeds
 RADIUS = 1.0              # metres by which the planner grows the walls: the Ant's legs
-GOAL = (24.0, 12.0)       # metres; the Ant starts at (0, 0), 26.8 m away
+GOAL = (24.0, 12.0)       # metres; the Ant starts at (0, 0)
 
 METHODS = {  # Table 2. The later wins: the file, EXPERIMENTS, MAZE, METHODS, flags
     "wedis": {},
@@ -66,9 +66,9 @@ METHODS = {  # Table 2. The later wins: the file, EXPERIMENTS, MAZE, METHODS, fl
 STUDY = dict(METHOD=" ".join(METHODS), POLICY_SEEDS="0 1 2", TRIALS=20)
 EXPERIMENTS = {  # a row names the constants in which an experiment differs; its name is that of its CSV
     "mazes": {},
-    "figure7": STUDY | dict(DRAW="fig07", SAMPLES="10 30 100 300 1000 3000"),  # it resumes
+    "figure7": STUDY | dict(DRAW="fig07", SAMPLES="10 30 100 300 1000 3000"),  # stopped, it goes on
     "fig18": dict(MAZES="s_maze obstacles", REWARDS="dense", MODES="closed", POLICY_SEEDS="0 1 2",
-                  DRAW="fig18"),  # 30 s
+                  DRAW="fig18"),
     "drive": dict(DRIVE=True, MAZES="open", MODES="closed"),
     "matched": STUDY | dict(DRAW="", LOOK_AHEAD="200 600"),  # all methods look equally far ahead
 }
@@ -77,7 +77,7 @@ MAZE = {  # walls, and the constants in which a maze differs; plan a row of your
     "maze1": dict(WALLS=HULL + [(17, 18, 5, 18), (5, 18, 5, 6)]),  # L; the trap is at the top left
     "maze2": dict(WALLS=HULL + [(7, 8, 4, 18), (16, 17, -6, 8)]),  # Z; the trap is at the bottom right
     "s_maze": dict(WALLS=[(-7, -6, -13, 13), (45, 46, -13, 13), (-7, 46, -13, -12), (-7, 46, 12, 13),
-                          (9, 10, -12, -0.5), (28, 29, 0.5, 12)],  # Fig 18: over one wall, under the next
+                          (9, 10, -12, -0.5), (28, 29, 0.5, 12)],
                    GOAL=(38.0, 0.0), HOLD=50, LENGTH=6, PLANNED=2, EPISODE=600),
     "obstacles": dict(WALLS=HULL + [(7, 9, 2.5, 4.5), (13, 15, 10, 12), (12, 14, 0, 2), (2, 4, 7, 9)],
                       GOAL=(17.0, 8.0), HOLD=50, LENGTH=5, PLANNED=1, EPISODE=250),
@@ -136,8 +136,8 @@ def plan(u, kind, samples, horizon, pool, s0):
 
 
 def run(u):
-    """Algorithm 2 for all cases and trials of a unit. Returns rows for the CSV and, for figures, trials 0 to
-    2 of each case with their poses (steps + 1, nq) and for each decision its step and path (H_P T + 1, 2)."""
+    """Algorithm 2 for all cases and trials of a unit. Returns rows for the CSV, and trials 0 to 2 of each
+    case with their poses (steps + 1, nq) and, for each plan, its step and path (H_P T + 1, 2)."""
     skill_steps = u.hold * u.length
     skills = u.episode // skill_steps
     cases = []
@@ -165,7 +165,7 @@ def run(u):
             chosen.append(z)
         commands = commands_of(u.policy, torch.stack(chosen), u.length)  # lines 17 and 18
         for _ in execute(u.policy, robots, commands, u.hold, closed, deterministic=closed):  # lines 13 to 19
-            poses.append(robots.qpos.copy())  # for figures
+            poses.append(robots.qpos.copy())
 
     rows = []
     for n, t in enumerate(trials):
@@ -268,10 +268,13 @@ def settings(method, maze, config, given):
     u.samples = numbers(u.samples, "--samples")
     u.look_ahead = numbers(u.look_ahead, "--look_ahead") if u.look_ahead else [0]
     u.policy_seeds = numbers(u.policy_seeds, "--policy_seeds", 0)
+    if "fig07" in DRAW and len(u.look_ahead) > 1:
+        stop("fig07 is for one --look_ahead")
     if u.episode < u.hold * u.length:
         stop(f"{of}: an episode has {u.episode} steps, but one skill {u.hold * u.length}")
-    if not all(len(wall) == 4 and wall[0] < wall[1] and wall[2] < wall[3] for wall in walls):
-        stop(f"{of}: WALLS: each is (x0, x1, y0, y1) in metres, with x0 < x1 and y0 < y1")
+    for wall in walls:
+        if not (isinstance(wall, tuple) and len(wall) == 4 and wall[0] < wall[1] and wall[2] < wall[3]):
+            stop(f"{of}: WALLS: each is (x0, x1, y0, y1), x0 < x1, y0 < y1")
     return u
 
 
@@ -302,7 +305,7 @@ def units_of(config, given):
 # -------- measuring, drawing: not part of the method
 
 def values_of(rows, column, **where):
-    """A column of the rows that agree with where: (policies, trials), empty if there are none."""
+    """A column of the rows that agree with where: (policies, trials)."""
     found = {}
     for row in rows:
         if all(row[name] == str(value) for name, value in where.items()):
@@ -364,10 +367,10 @@ def draw_fig07(rows, units, examples):
     panels, rng = dict.fromkeys((row["maze"], row["reward"]) for row in rows), np.random.default_rng(0)
     curves = dict.fromkeys((u.method, u.mode) for u in units)
     sizes = sorted({int(row["samples"]) for row in rows})
-    looks = list(zip([BLUE, RED, "#009E73", "#E69F00", "#CC79A7", "#56B4E9"], "osD^vP"))  # Okabe-Ito
+    colours = [BLUE, RED, "#009E73", "#E69F00", "#CC79A7", "#56B4E9"]  # Okabe-Ito
     figure, axes = plt.subplots(1, len(panels), figsize=(3.6 * len(panels), 4), sharey=True, squeeze=False)
     for ax, (maze, kind) in zip(axes[0], panels):
-        for (method, mode), (colour, marker) in zip(curves, cycle(looks)):
+        for (method, mode), colour, marker in zip(curves, cycle(colours), cycle("osD^vPX")):
             where = dict(maze=maze, reward=kind, method=method, mode=mode)
             found = {n: values_of(rows, "final_distance", samples=n, **where) for n in sizes}
             found = {n: values for n, values in found.items() if values.size}
@@ -389,9 +392,9 @@ def draw_fig07(rows, units, examples):
 
 
 def draw_examples(name, kind, rows, units, examples):
-    """Fig 8, 17, 18: planned and executed paths of the first policy, a row per maze and mode."""
-    seed = units[0].policy_seed
-    shown = [example for example in examples if (example.reward, example.u.policy_seed) == (kind, seed)]
+    """Fig 8, 17, 18: planned and executed paths of each method's first policy, a row per maze and mode."""
+    seed = {u.method: u.policy_seed for u in reversed(units)}
+    shown = [e for e in examples if e.reward == kind and e.u.policy_seed == seed[e.u.method]]
     if not shown:
         return print(f"no {name}: no trial has the {kind} reward")
     wide = min(3, shown[0].u.trials)
@@ -456,7 +459,7 @@ def draw_gif(rows, units, examples):
             spec.worldbody.add_site(pos=[x, y, 0], size=[0.15, 0.15, 0.15], rgba=[0, 0.45, 0.7, 1])
         model = spec.compile()
         model.vis.global_.azimuth, model.vis.global_.elevation = 90, -65
-        model.stat.extent *= 0.37  # the camera stands near enough for the walls to fill the picture
+        model.stat.extent *= 0.37  # the walls fill the picture
         pictures = [Image.fromarray(picture) for picture in render(model, example.poses[::8], 320, 480)]
         palette = pictures[0].quantize(48, Image.Quantize.MAXCOVERAGE)  # one for all, or colours flicker
         frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]

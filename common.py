@@ -33,7 +33,7 @@ CLASSES = dict(speed=4, direction=4, curvature=3, acceleration=3, x=4, y=4)  # o
 FRAME_SKIP = 5     # physics steps of 0.01 s per environment step
 FEEDBACK = 0.1     # closed loop: share of the distance to the reference added to a command (the paper: 0)
 CORRECTION = 0.2   # at most so much, trajectory units
-FASTEST = 1.0      # no command is longer, trajectory units: much longer ones make falls
+FASTEST = 1.0      # no command of it is longer: much longer ones make falls
 SOFT_START = 20    # environment steps over which the longest command grows from 0.2 to FASTEST
 FORMAT = 3         # of the artifacts; raise it when their meaning changes
 HERE = Path(__file__).resolve().parent
@@ -57,7 +57,7 @@ def convert(value, like, name, least=0):
     if kind is bool and text in ("true", "false"):
         return text == "true"
     if kind is tuple:
-        parts = value if isinstance(value, tuple) else text.split()
+        parts = value if isinstance(value, (tuple, list)) else text.split()
         if len(parts) == len(like):
             likes = [0.0 if "." in str(part) else one for part, one in zip(parts, like)]
             return tuple(convert(part, one, name, -1e9) for part, one in zip(parts, likes))
@@ -434,7 +434,7 @@ def execute(policy, robots, commands, hold, closed, deterministic):
                 reference = reference + policy.scale * c
 
 
-BLUE, RED, GREY = "#0072B2", "#D55E00", "#888888"  # of all plots
+BLUE, RED, GREY = "#0072B2", "#D55E00", "#888888"
 plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
                      "grid.alpha": 0.25, "figure.dpi": 110, "savefig.bbox": "tight", "legend.frameon": False,
                      "axes.titlesize": 10, "figure.constrained_layout.use": True})

@@ -51,6 +51,11 @@ def flags(tmp_path, capsys):
     return parse
 
 
+def test_a_tuple_in_a_row_may_be_a_list_and_have_no_points():
+    assert common.convert([5, 40], (1, 100), "--run") == (5, 40) and common.convert((24, 12), (1.0, 2.0), "x") == (24, 12)
+    assert common.convert("-5 3.5", (24, 12), "--goal") == (-5, 3.5)
+
+
 def test_flags_override_rows_and_rows_override_constants(flags):
     stage, config, given = flags()
     assert (stage["N"], type(stage["N"]), stage["SHARE"], given) == (10_000, int, 1.0, {})  # 1e4 means ten thousand

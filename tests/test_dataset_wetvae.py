@@ -408,7 +408,8 @@ def test_a_model_that_makes_no_sense_is_one_line(s2, inside, out, changed, words
     assert one_line(done) and words in done.stderr and not list(out.glob("*.pt")), done.stderr
 
 
-@pytest.mark.parametrize("row", [dict(MODELS={}), dict(MODELS={"a": {}}, COLUMNS=[("t", "b", 5)])])
+@pytest.mark.parametrize("row", [dict(MODELS={}), dict(MODELS={"a": {}}, COLUMNS=[("t", "b", 5)]),
+                                 dict(MODELS={"a": {}}, COLUMNS=["a"])])
 def test_columns_without_a_model_are_one_line_before_training(s2, inside, out, row):
     s2.EXPERIMENTS["main"] = row
     done = inside(s2, "--out", out)

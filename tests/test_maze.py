@@ -402,6 +402,10 @@ def test_trials_may_differ_by_method_and_what_cannot_be_drawn_is_said(s4, stage,
     done = stage(method="wedis few", mazes="maze1", modes=None, trials=None, draw="fig17")
     assert done.code == 0, done.err
     assert [ax.get_title() for ax in drawn[0].axes if ax.axison].count("few closed, maze1, ant_semi seed 0") == 1
+    s4.METHODS["far"] = dict(TRIALS=1, MODES="closed", POLICY_SEEDS="1")  # figures show each method's first policy
+    done = stage(method="few far", mazes="maze1", modes=None, trials=None, draw="fig17")
+    assert {ax.get_title() for ax in drawn[1].axes} == {f"{name}, maze1, ant_semi seed {n}" for n, name in
+                                                        enumerate(("few closed", "far closed"))}
     done = stage(mazes="maze1", rewards="dense", draw="fig08")
     assert done.code == 0 and "no fig08_mpc_examples: no trial has the sparse reward" in done.out
 
@@ -503,6 +507,7 @@ def test_without_a_gl_library_one_line_says_so(out):
     (dict(mazes="maze9"), "unknown 'maze9' in --mazes; allowed: maze1 maze2 s_maze obstacles"),
     (dict(modes="open"), "unknown 'open' in --modes; allowed: printed closed"),
     (dict(draw="fig99"), "unknown 'fig99' in --draw; allowed: "),
+    (dict(draw="fig07", look_ahead="200 400"), "fig07 is for one --look_ahead"),
     (dict(samples="10 0"), "--samples is '0', but must be a whole number of at least 1"),
     (dict(samples="10 x"), "--samples is 'x', but must be a whole number"), (dict(samples=""), "--samples is ''"),
     (dict(look_ahead="200 0"), "--look_ahead is '0', but must be a whole number of at least 1"),
@@ -519,7 +524,8 @@ def test_what_makes_no_sense_gets_one_line(stage, flags, line):
 
 
 @pytest.mark.parametrize("table, row, line", [
-    ("MAZE", dict(WALLS=[(1, 0, 0, 1)]), "each is (x0, x1, y0, y1) in metres"), ("MAZE", dict(HOLDS=3), "wedis in mine: HOLDS is no constant"),
+    ("MAZE", dict(WALLS=[(1, 0, 0, 1)]), "each is (x0, x1, y0, y1), x0 < x1"),
+    ("MAZE", dict(WALLS=[10, 11, -6, 6]), "each is (x0, x1, y0, y1)"), ("MAZE", dict(HOLDS=3), "wedis in mine: HOLDS is no constant"),
     ("METHODS", dict(HOLD="x"), "mine in maze1: HOLD is 'x', but must be a whole number"),
     ("METHODS", dict(PLANNED=0), "mine in maze1: PLANNED is 0, but must be a whole number of at least 1"),
     ("METHODS", dict(OUT="x"), "mine in maze1: OUT is no constant")])
