@@ -229,7 +229,7 @@ def find_relation(decoder, names, steps):
 def weak_supervision(dataset, x, key, settings):
     """The factors of interest {name: (low, high)}, in the order of z in all stages, and the classes of their
     labels (N, M). Exits with 2 if the settings of model `key` do not fit the data."""
-    globals().update(settings)
+    globals().update(settings)  # as in main
     truth = dict(zip(dataset["names"].tolist(), dataset["factors"].T.astype(np.float64)))
     ranges = dict(zip(truth, dataset["ranges"].tolist()))
     if x.shape[2] == 2:

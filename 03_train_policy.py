@@ -86,7 +86,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs
     "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, BASE_FRAME=False,
                          VARIANCE_SCALE=0.05, ROBOTS=64, SKILL_STEPS=100, CORRECTED=0.5, DISCOUNT=0.97,
                          Z_RANGE=1.0, MULTI_RUN=(6, 20), FIGURE="fig16_half_cheetah"),
-    "ant_world_frame": dict(BASE_FRAME=False),  # as in the paper: what the base frame is good for
+    "ant_world_frame": dict(BASE_FRAME=False),  # the paper's frame
     "ant_dads": dict(METHOD="dads", Z_RANGE=1.0, SKILL_STEPS=200, FIGURE="fig05_skills_dads"),
     "ant_sectar": SECTAR | dict(FIGURE="fig05_skills_sectar"),
     "ant_sectar_no_explorer": SECTAR | dict(EXPLORE=0.0),  # what the explorer is good for
@@ -184,7 +184,7 @@ def train_wedis(run):
         return torch.cat([torch.randn(n, m1), correction], 1)
 
     def command_of(z):
-        """z of draw -> mean, moved by the correction, and log-variance of the step, (n, 2 or 1) each."""
+        """z of draw -> mean plus correction, and log-variance, of the step, (n, 2 or 1) each."""
         mean, log_var = run.decoder(z[:, :m1], 1)  # Alg. 1: z = (z_single, 0)
         return mean[:, 0] + z[:, m1:], log_var[:, 0]
 
@@ -356,7 +356,7 @@ def main():
              updates=run.sac.updates, env_steps=run.steps * ROBOTS, seconds=run.seconds)
     policy = SimpleNamespace(**load(OUT, "policy", EXPERIMENT, SEED, **fixed))
     if policy.names and not torch.equal(policy.decoder.head[2].bias, source["decoder"].head[2].bias):
-        stop(f"the policy was trained with another decoder {DECODER} than the present one")
+        stop(f"the policy has another decoder {DECODER}: train anew, or choose another --out")
     measure(policy, source["ranges"])
     draw_skills(policy)
 
@@ -612,7 +612,7 @@ def draw_skills(policy):
         colours = ["#D55E00", "#009E73", "#0072B2", "#56B4E9", "#F0E442"]  # as the paper's
         if name == "direction" and policy.decoder.circle is not None:
             values = np.linspace(-1.5, 1.5, 17)[:-1]
-            colours = plt.get_cmap("twilight")(np.linspace(0.1, 0.9, 16))
+            colours = plt.get_cmap("twilight")(np.linspace(0.1, 0.9, len(values)))
         z = traversal(policy, i, values)
         paths = [predicted_path(policy, z, run)]
         paths += [roll_out(policy, z, run, closed) for closed in (False, True)[:len(rows) - 1]]

@@ -33,7 +33,7 @@ CLASSES = dict(speed=4, direction=4, curvature=3, acceleration=3, x=4, y=4)  # o
 FRAME_SKIP = 5     # physics steps of 0.01 s per environment step
 FEEDBACK = 0.1     # closed loop: share of the distance to the reference added to a command (the paper: 0)
 CORRECTION = 0.2   # at most so much, trajectory units
-FASTEST = 1.0      # no command of it is longer: much longer ones make falls
+FASTEST = 1.0      # its longest command: much longer ones make falls
 SOFT_START = 20    # environment steps over which the longest command grows from 0.2 to FASTEST
 FORMAT = 3         # of the artifacts; raise it when their meaning changes
 HERE = Path(__file__).resolve().parent
@@ -67,8 +67,9 @@ def convert(value, like, name, least=0):
         number = float(text)
         if kind in (int, float) and least <= number < math.inf and number == kind(number):
             return kind(number)
-    kinds = {bool: "true or false", int: f"a whole number of at least {least}, like {like} in the file",
-             float: f"a number of at least {least:g}", tuple: f"{np.size(like)} numbers"}
+    bound = f" of at least {least}" * (least >= 0)
+    kinds = {bool: "true or false", int: f"a whole number{bound}, like {like} in the file",
+             float: f"a number{bound}", tuple: f"{np.size(like)} numbers"}
     stop(f"{name} is {value!r}, but must be {kinds[kind]}")
 
 

@@ -538,7 +538,7 @@ SECTIONS = [
      "that z_direction decodes to. Acceleration is a share of the speed per transition.", full_wetvae),
     ("Over seeds", "Rows of wetvae.csv with the same settings. Intervals: 95 % bootstrap of the mean over seeds (of three or more).", full_seeds),
     ("Policies (03): policies.csv", "Tracking error: RMS(executed end - predicted end) / RMS(predicted end) over a grid of skills, "
-     "100 steps from rest (SeCTAR: 25 draws, 50 steps). Following error: |executed - predicted end| of random skills of 200 steps "
+     "100 steps from rest (SeCTAR: 25 draws, 50 steps). Following error: |end - sum of its commands| of random skills of 200 steps "
      "(Half-Cheetah: 120) from 400 noisy starts, three in a row. Falls: robots that turn over in that time. Baselines have no "
      "closed loop.", full_policies),
     ("Mazes (04): mazes.csv", "Intervals of all planning tables: 95 % bootstrap over policies and trials of each; with one "

@@ -56,6 +56,12 @@ def test_a_tuple_in_a_row_may_be_a_list_and_have_no_points():
     assert common.convert("-5 3.5", (24, 12), "--goal") == (-5, 3.5)
 
 
+def test_a_tuple_of_words_is_one_line_without_a_bound(capsys):
+    with pytest.raises(SystemExit):
+        common.convert("a b", (1, 100), "--run")
+    assert capsys.readouterr().err.endswith("--run is 'a', but must be a whole number, like 1 in the file\n")
+
+
 def test_flags_override_rows_and_rows_override_constants(flags):
     stage, config, given = flags()
     assert (stage["N"], type(stage["N"]), stage["SHARE"], given) == (10_000, int, 1.0, {})  # 1e4 means ten thousand
