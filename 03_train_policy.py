@@ -13,70 +13,71 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
-from common import (CORRECTION, HERE, MULTI, SINGLE, Actor, Decoder, Robots, artifact_name,  # before mujoco
-                    commands_of, cross_talk, execute, factors_of, layers, load, parse_flags, plt, save,
-                    save_figure, stop, update_csv)
-import mujoco
+import common  # before mujoco: it chooses how mujoco renders
+from common import (MULTI, SINGLE, Actor, Count, Decoder, Positive, Share, commands_of, execute, factors_of,
+                    layers, plt, stop)
 import numpy as np
 import torch
 from torch import nn
 
-EXPERIMENT = "ant_semi"  # row of EXPERIMENTS below
-SEED = 0                 # random seed
-OUT = "runs"             # folder that everything is written to
-TRAIN = True             # false: only measure and draw what is already trained
-RESUME = False           # true: continue from the last checkpoint
-THREADS = 2              # CPU threads; 1: updates wait for the robots' step, with the same result
-REPORTS = 20             # printed lines, points of the learning curve, and checkpoints
+EXPERIMENT: str = "ant_semi"  # row of EXPERIMENTS below
+SEED: int = 0                 # random seed of the whole chain: data, decoder, policy
+OUT: str = "runs"             # folder that everything is written to
+TRAIN: bool = True            # false: only measure and draw what is already trained
+RESUME: bool = False          # true: continue from the last checkpoint
+THREADS: Count = 2            # CPU threads; 1: updates wait for the robots' step, with the same result
+REPORTS: Count = 20           # printed lines, points of the learning curve, and checkpoints
 
-METHOD = "wedis"         # wedis, dads or sectar
-DECODER = "main"         # experiment of 02 whose decoder is the reward
-DECODER_SEED = 0         # and its seed
-ROBOT = "ant"            # ant or half_cheetah
-STEP_SCALE = 0.1         # metres per trajectory unit, App. A.1.3: 1/10, Half-Cheetah 1/5
-VARIANCE_SCALE = 0.003   # decoder variance -> square metres (A.1.3: 1/20, which leaves fast skills too slow)
-BASE_FRAME = True        # networks read state and command in the base frame (the paper: in the world's)
+METHOD: str = "wedis"         # wedis, dads or sectar
+DECODER: str = "main"         # model of 02 whose decoder is the reward
+ROBOT: str = "ant"            # ant or half_cheetah
+STEP_SCALE: Positive = 0.1    # metres per trajectory unit, App. A.1.3: 1/10, Half-Cheetah 1/5
+VARIANCE_SCALE: Positive = 0.003  # decoder variance -> square metres (the paper: 0.05, and fast skills lag)
+BASE_FRAME: bool = True       # networks read state and command in the base frame (the paper: false)
 
-UPDATES = 100_000        # updates of the critics (the paper: 1.92 million)
-ROBOTS = 256             # robots that step together
-EPISODE = 200            # steps until a robot starts anew; no terminal state: the value goes on
-SKILL_STEPS = 25         # steps until a robot is given a new skill
-WARM_UP = 10_000         # steps with random actions; their statistics normalise the state
-REPLAY = 1_000_000       # steps in the replay buffer R; at least two skills of all robots
-UPDATES_PER_STEP = 8     # updates in each step of all robots
-BATCH = 256              # App. A.1.3
-RELABELLED = 0.5         # share of a batch that is relabelled with a fresh skill (the paper: 0)
-CORRECTED = 0.25         # share of skills with a random correction, as the closed loop adds it (the paper: 0)
+UPDATES: Count = 100_000      # updates of the critics (the paper: 1,920,000)
+ROBOTS: Count = 256           # robots that step together
+EPISODE: Count = 200          # steps until a robot starts anew; no terminal state: the value goes on
+SKILL_STEPS: Count = 25       # steps until a robot is given a new skill
+WARM_UP: Count = 10_000       # steps with random actions; their statistics normalise the state
+REPLAY: Count = 1_000_000     # steps in the replay buffer R
+UPDATES_PER_STEP: Count = 8   # updates in each step of all robots
+BATCH: Count = 256            # App. A.1.3
+RELABELLED: Share = 0.5       # share of a batch that is relabelled with a fresh skill (the paper: 0)
+CORRECTED: Share = 0.25       # share of skills with a random correction, as in closed loop (the paper: 0)
 
-HIDDEN = 256             # width of both hidden layers (the paper: 512; Half-Cheetah 256)
-LEARNING_RATE = 1e-3     # Adam (the paper: 3e-4, fixed)
-DECAY_FROM = 0.5         # share of the updates after which it falls linearly to 0
-ACTOR_EVERY = 2          # updates of the critics for each of actor and value network (usual: 1)
-AVERAGED = 0.002         # rate of the running average of the actor's weights, which is the policy
-DISCOUNT = 0.98          # gamma of Eq. 1 (the paper: 0.99): a shorter horizon teaches to follow sooner
-SMOOTHING = 0.01         # of the target value network, App. A.1.3
-REWARD_SCALE = 0.1       # of Eq. 6 (the paper: 1)
-TEMPERATURE = 0.003      # alpha, weight of the entropy (the paper: 0.01, which is 0.001 at our reward scale)
-FLOOR_START = 0.04       # metres, least standard deviation in the reward; if small, robots stand still
-FLOOR_END = 0.01         # the same from 60 % of the updates on; it shrinks after 15 %: teaches slow skills
+HIDDEN: Count = 256           # width of both hidden layers (the paper: 512; Half-Cheetah 256)
+LEARNING_RATE: Positive = 1e-3  # Adam (the paper: 0.0003, fixed)
+DECAY_FROM: Share = 0.5       # share of the updates after which it falls linearly to 0 (the paper: 1)
+ACTOR_EVERY: Count = 2        # updates of the critics for each of actor and value network (the paper: 1)
+AVERAGED: Share = 0.002       # rate of the average of the actor's weights that is the policy (the paper: 1)
+DISCOUNT: Share = 0.98        # gamma of Eq. 1 (the paper: 0.99): a shorter horizon teaches to follow sooner
+SMOOTHING: Share = 0.01       # of the target value network, App. A.1.3
+REWARD_SCALE: float = 0.1     # of Eq. 6 (the paper: 1)
+TEMPERATURE: float = 0.003    # alpha, weight of the entropy (the paper: 0.01; at our reward scale 0.001)
+FLOOR_START: float = 0.04     # metres, least standard deviation in the reward; if small, robots stand still
+FLOOR_END: float = 0.01       # the same when it has shrunk: this teaches slow skills (the paper: no floor, 0)
+FLOOR_FROM: Share = 0.15      # share of the updates after which the floor shrinks, geometrically
+FLOOR_UNTIL: Share = 0.6      # share of the updates at which it reaches FLOOR_END
 
 # Baselines only
-Z_DIM = 2                # entries of z: DADS 2, SeCTAR 8
-RECENT = 40_000          # latest steps that a baseline's model learns from
-MODEL_BATCH = 256        # steps (DADS), trajectories (SeCTAR) in a batch
-PRIOR_SAMPLES = 100      # L of DADS's reward
-EXPLORE = 0.5            # SeCTAR: share of trajectories of the explorer (0.0: no explorer)
-EXPLORER = 3.0           # last entry of an explorer's z, and length of its commands
-KL_WEIGHT = 2.0          # SeCTAR: of the KL divergence in its ELBO
+Z_DIM: Count = 2              # entries of z: DADS 2, SeCTAR 8
+RECENT: Count = 40_000        # latest steps that a baseline's model learns from
+MODEL_BATCH: Count = 256      # steps (DADS), trajectories (SeCTAR) in a batch
+MODEL_UPDATES: Count = 4      # DADS: updates of the skill dynamics in each step of all robots
+PRIOR_SAMPLES: Count = 100    # L of DADS's reward
+EXPLORE: Share = 0.5          # SeCTAR: share of trajectories of the explorer (0: no explorer)
+EXPLORER: Positive = 3.0      # last entry of an explorer's z, and length of its commands
+KL_WEIGHT: float = 2.0        # SeCTAR: of the KL divergence in its ELBO
 
 # Measuring only: never an obstacle to --resume
-Z_RANGE = 1.5            # the axes of z are measured from -Z_RANGE to Z_RANGE
-SINGLE_RUN = (1, 100)    # T and H_z of the tracking error and of Fig 5 for z_single, Sec. 6.1.2
-MULTI_RUN = (5, 40)      # T and H_z of the following error, of purity and of Fig 5 for z_multi
-TRAVERSAL = 13           # skills on each axis at which purity is measured
-NOISY = 16               # noisy starts that are averaged for purity
-STARTS = 400             # noisy starts of the following error
-FIGURE = ""              # name of the figure of skills ("": skills_<experiment>)
+Z_RANGE: Positive = 1.5       # skills are measured for z from -Z_RANGE to Z_RANGE
+SINGLE_RUN: tuple[Count, Count] = (1, 100)  # T, H_z of the tracking error and Fig 5 for z_single, Sec. 6.1.2
+MULTI_RUN: tuple[Count, Count] = (5, 40)  # T, H_z of the following error, purity and Fig 5 for z_multi
+TRAVERSAL: Count = 13         # skills on each axis at which purity is measured
+NOISY: Count = 16             # noisy starts that are averaged for purity
+STARTS: Count = 400           # noisy starts of the following error
+FIGURE: str = ""              # name of the figure of skills ("": skills_<experiment>)
 
 SECTAR = dict(METHOD="sectar", UPDATES=66_000, Z_DIM=8, SKILL_STEPS=50, RECENT=512_000, MODEL_BATCH=128,
               REWARD_SCALE=1.0, SINGLE_RUN=(50, 1), MULTI_RUN=(50, 1))  # as many minutes as WEDIS
@@ -87,12 +88,99 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs
                          VARIANCE_SCALE=0.05, ROBOTS=64, SKILL_STEPS=100, CORRECTED=0.5, DISCOUNT=0.97,
                          Z_RANGE=1.0, MULTI_RUN=(6, 20), FIGURE="fig16_half_cheetah"),
     "ant_world_frame": dict(BASE_FRAME=False),  # the paper's frame
-    "ant_dads": dict(METHOD="dads", Z_RANGE=1.0, SKILL_STEPS=200, FIGURE="fig05_skills_dads"),
+    "ant_dads": dict(METHOD="dads", Z_RANGE=1.0, SKILL_STEPS=200, REWARD_SCALE=1.0, MULTI_RUN=(1, 200),
+                     FIGURE="fig05_skills_dads"),
     "ant_sectar": SECTAR | dict(FIGURE="fig05_skills_sectar"),
     "ant_sectar_no_explorer": SECTAR | dict(EXPLORE=0.0),  # what the explorer is good for
 }
-MAY_DIFFER = ("OUT TRAIN RESUME THREADS REPORTS UPDATES Z_RANGE SINGLE_RUN MULTI_RUN TRAVERSAL NOISY STARTS "
-              "FIGURE").split()  # from those of a checkpoint
+MAY_DIFFER = (  # between a policy, or a checkpoint, and the run that uses it
+    "OUT TRAIN RESUME THREADS REPORTS UPDATES Z_RANGE SINGLE_RUN MULTI_RUN TRAVERSAL NOISY STARTS FIGURE "
+    "FEEDBACK FASTEST SOFT_START SOFT_FROM CLASSES").split()
+
+
+# -------- Eq. 6 and Algorithm 1, policy training
+
+def reward(mean, log_var, displacement, floor):
+    """log p_theta(s_t+1 | s_t, z) of Eq. 6, (B,), without its normaliser, which depends on the skill alone;
+    the entropy of Eq. 6 is in Sac.update. mean, log_var (B, 2 or 1) of the decoder: trajectory units;
+    displacement (B, 2 or 1), floor: metres. At the end of the Ant's training four fifths of the deviations
+    are on the floor of 1 cm: the reward is then nearly -|displacement - command|^2 / (2 floor^2)."""
+    variance = (VARIANCE_SCALE * log_var.exp()).clamp(min=floor ** 2)
+    return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * mean) ** 2 / variance).sum(1)
+
+
+def random_corrections(n, x_dim):
+    """Changes of a command as the closed loop makes them, (n, x_dim): 0, but with probability CORRECTED
+    uniform in a disc of radius common.CORRECTION."""
+    length = common.CORRECTION * torch.rand(n, 1).sqrt() * (torch.rand(n, 1) < CORRECTED)
+    return length * nn.functional.normalize(torch.randn(n, x_dim))
+
+
+def train_wedis(decoder, names):
+    """Alg. 1, the second loop: a policy that follows the decoder's single steps. names: of the axes of z.
+    Returns the policy. Shapes beside the lines: the Ant, n = ROBOTS, B = UPDATES_PER_STEP * BATCH = 2048."""
+    x_dim, m1 = decoder.x_dim, sum(name in SINGLE for name in names)
+    m2 = len(names) - m1
+    (robots, rng), worker = start_robots(), ThreadPoolExecutor(1)
+    s_dim, a_dim = robots.observe().shape[1], robots.ctrl.shape[1]
+    sac = Sac(s_dim, x_dim, a_dim)
+    replay = Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=x_dim, z_single=m1, correction=x_dim)
+    log = Log(make_policy(sac, decoder, names, STEP_SCALE), robots, rng, replay, sac)
+    skills = replay.latest(ROBOTS)  # zeros, or a checkpoint's
+    z_single, correction = skills.z_single, skills.correction
+
+    while sac.updates < UPDATES:
+        # Alg. 1: sample z_single from the prior, for the robots whose skill is over; set z = (z_single, 0)
+        over = robots.age() % SKILL_STEPS == 0                                       # (n, 1)
+        correction = torch.where(over, random_corrections(ROBOTS, x_dim), correction)  # (n, 2)
+        z_single = torch.where(over, torch.randn(ROBOTS, m1), z_single)              # (n, 2)
+        z = torch.cat([z_single, torch.zeros(ROBOTS, m2)], 1)                        # (n, 3)
+        mean, _ = decoder(z, 1)                                                      # (n, 1, 2)
+        command = mean[:, 0] + correction                                            # (n, 2)
+
+        # Alg. 1: execute actions a ~ pi(a | s, z_single). The second core steps the robots from here on
+        s = robots.observe()                                                         # (n, 27)
+        a = sac.actor.act(s, command)                                                # (n, 8)
+        if replay.added < WARM_UP:
+            a = torch.rand(a.shape) * 2 - 1
+        physics = worker.submit(robots.step, a.numpy())
+        if THREADS == 1:
+            physics.result()
+
+        if replay.added >= WARM_UP:
+            if sac.updates == 0:
+                sac.normalise(replay.read(slice(0, replay.added)).s)
+            # Alg. 1: sample a batch of transitions. Relabelling: any step can be judged by any skill
+            batch = replay.sample(UPDATES_PER_STEP * BATCH)                          # (B, ..) each
+            fresh = torch.rand(len(batch.s), 1) < RELABELLED                         # (B, 1)
+            batch.correction = torch.where(fresh, random_corrections(len(fresh), x_dim), batch.correction)
+            batch.z_single = torch.where(fresh, torch.randn(len(fresh), m1), batch.z_single)
+            z = torch.cat([batch.z_single, torch.zeros(len(fresh), m2)], 1)          # (B, 3)
+
+            # Alg. 1: compute the reward r = log p_theta(s_t+1 | s_t, z), Eq. 6
+            mean, log_var = (out[:, 0] for out in decoder(z, 1))                     # (B, 2) each
+            floor = floor_at(sac.updates / UPDATES)
+            r = reward(mean + batch.correction, log_var, batch.displacement, floor)  # (B,)
+            on_floor = (VARIANCE_SCALE * log_var.exp() < floor ** 2).float().mean()
+
+            # Alg. 1: optimize psi and the critics with the SAC, BATCH steps at a time
+            losses = sac.learn(batch, mean + batch.correction, mean + batch.correction, r)
+            log.numbers = losses | dict(reward=r.mean(), on_floor=on_floor)
+
+        # Alg. 1: collect the samples in the replay buffer R
+        displacement, unstable = physics.result()
+        replay.add(unstable, s=s, a=a, s2=robots.observe(), displacement=displacement, z_single=z_single,
+                   correction=correction)
+        robots.reset(np.flatnonzero((robots.age()[:, 0].numpy() >= EPISODE) | unstable), rng)
+        log.step()
+    return log.policy
+
+
+def floor_at(progress):
+    """The least standard deviation in the reward, metres, when a share `progress` of the training is done."""
+    shrunk = min(1, max(0, (progress - FLOOR_FROM) / max(FLOOR_UNTIL - FLOOR_FROM, 1e-9)))
+    return FLOOR_START * (FLOOR_END / max(FLOOR_START, 1e-9)) ** shrunk
+
 
 # -------- SAC (Haarnoja et al. 2017), App. A.1.3
 
@@ -127,7 +215,7 @@ class Sac(nn.Module):
         self.average = copy.deepcopy(self.actor).requires_grad_(False)
         self.critic_adam = torch.optim.Adam(self.critics.parameters(), fused=True)
         self.actor_adam = torch.optim.Adam([*self.actor.parameters(), *self.value.parameters()], fused=True)
-        self.updates = 0
+        self.updates, self.losses = 0, {}
 
     def normalise(self, s):
         """Fix the mean and deviation of the state, from random steps s (N, s_dim)."""
@@ -136,233 +224,72 @@ class Sac(nn.Module):
         self.actor.s_std.copy_(x.std(0).clamp(min=1e-3))
         self.average.load_state_dict(self.actor.state_dict())
 
+    def learn(self, batch, c, c2, r):
+        """Updates with the steps of batch, BATCH at a time. c, c2 (B, c_dim): commands before and after the
+        step; r (B,): rewards. Returns the last losses."""
+        left = (1 - self.updates / UPDATES) / max(1 - DECAY_FROM, 1e-9)
+        for group in self.critic_adam.param_groups + self.actor_adam.param_groups:
+            group["lr"] = LEARNING_RATE * min(1, left)
+        x, x2 = self.actor.inputs(batch.s, c), self.actor.inputs(batch.s2, c2)
+        for part in zip(x.split(BATCH), batch.a.split(BATCH), x2.split(BATCH), r.split(BATCH)):
+            self.update(*part)
+        return self.losses
+
     def update(self, x, a, x2, r):
-        """One update; no step is terminal. x, x2 (B, n): Actor.inputs before and after the step; a (B, m);
-        r (B,). Returns a loss, to detect nan."""
+        """One update; no step is terminal. x, x2 (b, n): Actor.inputs before and after the step; a (b, m);
+        r (b,)."""
         with torch.no_grad():
             q_target = r + DISCOUNT * self.target(x2).squeeze(1)
-        q_loss = 0.5 * ((self.critics(x, a) - q_target) ** 2).mean(1).sum()
+        q = self.critics(x, a)
+        q_loss = 0.5 * ((q - q_target) ** 2).mean(1).sum()
         self.critic_adam.zero_grad()
         q_loss.backward()
         self.critic_adam.step()
         self.updates += 1
+        self.losses |= dict(q=q.detach().mean(), q_loss=q_loss.detach())
         if self.updates % ACTOR_EVERY:
-            return q_loss.item()
+            return
         a_new, log_prob = self.actor(x)
         self.critics.requires_grad_(False)  # or backward computes their gradients too
         q_new = self.critics(x, a_new).min(0).values
         self.critics.requires_grad_(True)
         actor_loss = (TEMPERATURE * log_prob - q_new).mean()
         v_loss = 0.5 * ((self.value(x).squeeze(1) - (q_new - TEMPERATURE * log_prob).detach()) ** 2).mean()
-        loss = actor_loss + v_loss  # they share no parameter
         self.actor_adam.zero_grad()
-        loss.backward()
+        (actor_loss + v_loss).backward()  # one backward for both: they share no parameter
         self.actor_adam.step()
         with torch.no_grad():
             torch._foreach_lerp_([*self.target.parameters()], [*self.value.parameters()], SMOOTHING)
-            torch._foreach_lerp_([*self.average.net.parameters()], [*self.actor.net.parameters()], AVERAGED)
-        return loss.item()
-
-
-# -------- Algorithm 1, policy training
-
-def reward(mean, log_var, displacement, floor):
-    """log p of Eq. 6 for one step, (B,), without its normaliser, which depends on the skill alone. mean,
-    log_var (B, 2 or 1): trajectory units; displacement, floor: metres. Eq. 6's entropy is in Sac.update."""
-    variance = (VARIANCE_SCALE * log_var.exp()).clamp(min=floor ** 2)
-    return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * mean) ** 2 / variance).sum(1)
-
-
-def train_wedis(run):
-    """Alg. 1, the second loop: train run.sac to follow the decoder's single steps."""
-    x_dim, m1 = run.decoder.x_dim, run.z.shape[1] - run.decoder.x_dim
-
-    def draw(n):
-        """z_single ~ prior and, beside it, a correction of the command as the closed loop adds it."""
-        length = CORRECTION * torch.rand(n, 1).sqrt() * (torch.rand(n, 1) < CORRECTED)  # uniform in a disc
-        correction = length * nn.functional.normalize(torch.randn(n, x_dim))
-        return torch.cat([torch.randn(n, m1), correction], 1)
-
-    def command_of(z):
-        """z of draw -> mean plus correction, and log-variance, of the step, (n, 2 or 1) each."""
-        mean, log_var = run.decoder(z[:, :m1], 1)  # Alg. 1: z = (z_single, 0)
-        return mean[:, 0] + z[:, m1:], log_var[:, 0]
-
-    while run.sac.updates < UPDATES:
-        run.renew(draw(ROBOTS))  # Alg. 1: sample z_single from the prior
-        command, _ = command_of(run.z)
-        run.act(command)  # Alg. 1: execute actions; the physics runs on the second core from here on
-
-        if run.warm():
-            shrunk = min(1, max(0, (run.sac.updates / UPDATES - 0.15) / 0.45))
-            floor = FLOOR_START * (FLOOR_END / FLOOR_START) ** shrunk
-            s, a, s2, displacement, z = run.sample(UPDATES_PER_STEP * BATCH)  # Alg. 1: sample a batch
-            fresh = torch.rand(len(z), 1) < RELABELLED
-            z = torch.where(fresh, draw(len(z)), z)  # any stored step can be judged by any skill
-            command, log_var = command_of(z)
-            r = reward(command, log_var, displacement, floor)  # Alg. 1: compute the reward, Eq. 6
-            run.learn(s, a, s2, command, command, r)  # Alg. 1: optimize psi and the critics with the SAC
-        run.collect()  # Alg. 1: the samples go to the replay buffer R
-
-
-def make_robots(n, threads):
-    return Robots(mujoco.MjSpec.from_file(str(HERE / f"{ROBOT}.xml")), n, threads)
-
-
-class Run:
-    """What the three loops share: robots, replay buffer, SAC, clock, reports and checkpoints."""
-
-    def __init__(self, decoder, names, z_dim, c_dim, fixed, model=None):
-        self.decoder, self.names, self.fixed = decoder, names, fixed
-        self.rng = np.random.default_rng(SEED)
-        self.robots = make_robots(ROBOTS, 1)
-        self.robots.reset(np.arange(ROBOTS), self.rng)
-        s_dim, a_dim = self.robots.observe().shape[1], self.robots.ctrl.shape[1]
-        self.sac = Sac(s_dim, c_dim, a_dim)
-        self.parts = [self.sac, self.sac.critic_adam, self.sac.actor_adam]
-        if model:  # what else a baseline learns
-            self.model = nn.ModuleDict(model)
-            self.adam = torch.optim.Adam(self.model.parameters(), lr=LEARNING_RATE, fused=True)
-            self.parts += [self.model, self.adam]
-        self.widths = (s_dim, a_dim, s_dim, self.robots.places, z_dim)  # s, a, s', displacement, z
-        block = ROBOTS * SKILL_STEPS
-        self.replay = torch.zeros(max(2, REPLAY // block) * block, sum(self.widths))
-        self.z = torch.zeros(ROBOTS, z_dim)
-        self.age = self.rng.integers(0, EPISODE, ROBOTS)  # each robot changes skills at its own time
-        if METHOD == "sectar":
-            self.age -= self.age % SKILL_STEPS  # together: trajectories are rows of the replay buffer
-        self.steps, self.seconds, self.curve, self.losses = 0, 0.0, [], {}
-        self.worker, self.clock = ThreadPoolExecutor(1), time.time()
-        if RESUME:
-            self.resume()
-
-    def renew(self, z):
-        """Take new skills z (ROBOTS, z_dim) for the robots whose SKILL_STEPS are over."""
-        over = torch.from_numpy(self.age % SKILL_STEPS == 0)
-        self.z = torch.where(over[:, None], z, self.z)
-
-    def act(self, command):
-        """Begin one step of all robots: a ~ pi(a | s, c), random during the warm-up. collect ends it."""
-        s = self.robots.observe()
-        a = self.sac.actor.act(s, command)
-        if self.steps * ROBOTS < WARM_UP:
-            a = torch.rand(a.shape) * 2 - 1
-        step = self.worker.submit(self.robots.step, a.numpy())
-        if THREADS == 1:
-            step.result()
-        self.begun = s, a, step
-
-    def warm(self):
-        """Whether the warm-up is over. At its end the statistics of the state are fixed."""
-        if self.steps * ROBOTS < WARM_UP:
-            return False
-        if self.sac.updates == 0:
-            self.sac.normalise(self.replay[:self.steps * ROBOTS, :self.widths[0]])
-        return True
-
-    def sample(self, n, recent=None):
-        """n random steps, of the `recent` latest ones: s, a, s', displacement in metres, z."""
-        filled = min(self.steps * ROBOTS, len(self.replay))
-        back = torch.randint(min(recent or filled, filled), (n,))
-        return self.replay[(self.steps * ROBOTS - 1 - back) % len(self.replay)].split(self.widths, 1)
-
-    def learn(self, s, a, s2, c, c2, r):
-        """SAC updates, one for each BATCH of steps; c, c2: the commands before and after."""
-        left = 1 - self.sac.updates / UPDATES
-        for group in self.sac.critic_adam.param_groups + self.sac.actor_adam.param_groups:
-            group["lr"] = LEARNING_RATE * min(1, left / max(1 - DECAY_FROM, 1e-9))
-        x, x2 = self.sac.actor.inputs(s, c), self.sac.actor.inputs(s2, c2)
-        for batch in zip(*(part.split(BATCH) for part in (x, a, x2, r))):
-            loss = self.sac.update(*batch)
-        self.losses = dict(reward=r.mean().item(), loss=loss)
-
-    def collect(self):
-        """End the step: fill the replay buffer, start old robots anew, report and save a checkpoint."""
-        s, a, step = self.begun
-        displacement, failed = step.result()
-        rows = (self.steps * ROBOTS + torch.arange(ROBOTS)) % len(self.replay)
-        self.replay[rows] = torch.cat([s, a, self.robots.observe(), displacement, self.z], 1)
-        self.replay[rows[failed]] = self.replay[rows[failed] - ROBOTS]  # they mean nothing: repeat the last
-        self.steps += 1
-        self.age = (self.age + 1) % EPISODE
-        self.robots.reset(np.flatnonzero((self.age == 0) | failed), self.rng)
-        self.seconds += time.time() - self.clock
-        if not all(math.isfinite(value) for value in self.losses.values()):
-            stop(f"a loss is not finite after {self.sac.updates} updates: {self.losses}; lower "
-                 "--learning_rate, or --resume true from the last good checkpoint", code=1)
-        reported = self.curve[-1]["updates"] if self.curve else 0
-        if self.sac.updates >= min(UPDATES, reported + UPDATES / REPORTS):
-            self.report()
-        self.clock = time.time()
-
-    def report(self):
-        """One line, one point of the learning curve, and a checkpoint."""
-        policy = SimpleNamespace(actor=self.sac.average, decoder=self.decoder, names=self.names,
-                                 scale=STEP_SCALE, method=METHOD, relation={})  # in the grid z_multi is 0
-        row = dict(updates=self.sac.updates, env_steps=self.steps * ROBOTS, minutes=self.seconds / 60,
-                   tracking_error=tracking(policy, False))
-        if self.names:
-            row["tracking_error_closed"] = tracking(policy, True)
-        self.curve.append(row | self.losses)
-        text = [f"{name} {round(value, 3)}" for name, value in self.curve[-1].items()]
-        left = self.seconds / 60 * (UPDATES / self.sac.updates - 1)
-        speed = self.sac.updates / self.seconds
-        print(*text, f"{speed:.0f} updates/s", f"{left:.1f} min left", sep="  ", flush=True)
-        save(OUT, "policy-checkpoint", EXPERIMENT, SEED, self.fixed, z=self.z,
-             robots=torch.from_numpy(self.robots.batch.state.copy()), age=torch.from_numpy(self.age),
-             replay=self.replay[:self.steps * ROBOTS].clone(), curve=self.curve,
-             numbers=[self.sac.updates, self.steps, self.seconds], torch_rng=torch.get_rng_state(),
-             numpy_rng=self.rng.bit_generator.state, parts=[part.state_dict() for part in self.parts])
-
-    def resume(self):
-        if not (Path(OUT) / artifact_name("policy-checkpoint", EXPERIMENT, SEED)).exists():
-            return print("there is no checkpoint yet")
-        state = load(OUT, "policy-checkpoint", EXPERIMENT, SEED, **self.fixed)
-        for part, saved in zip(self.parts, state["parts"]):
-            part.load_state_dict(saved)
-        self.replay[:len(state["replay"])] = state["replay"]
-        self.z, self.age, self.curve = state["z"], state["age"].numpy(), state["curve"]
-        self.sac.updates, self.steps, self.seconds = state["numbers"]
-        self.robots.batch.state[:] = state["robots"].numpy()
-        torch.set_rng_state(state["torch_rng"])
-        self.rng.bit_generator.state = state["numpy_rng"]
+            rate = AVERAGED or 1.0  # 0 switches the average off
+            torch._foreach_lerp_([*self.average.net.parameters()], [*self.actor.net.parameters()], rate)
+        self.losses |= dict(actor_loss=actor_loss.detach())
 
 
 # -------- main
 
 def main():
-    config, _ = parse_flags(globals())
+    config, _ = common.parse_flags(globals())
     torch.set_num_threads(1)
-    fixed = {name: value for name, value in config.items() if name not in MAY_DIFFER}
-    source = load(OUT, "wetvae", DECODER, DECODER_SEED)
-    decoder, names = source["decoder"], source["names"]
-    check_constants(source)
-    torch.manual_seed(SEED)
+    source = common.load(OUT, "wetvae", DECODER, SEED)
+    check(source)
     if TRAIN:
-        shared = fixed | dict(DECODER_SHA256=source["sha256"])
-        if METHOD == "wedis":
-            m1 = sum(name in SINGLE for name in names)
-            run = Run(decoder, names, m1 + decoder.x_dim, decoder.x_dim, shared)
-            train_wedis(run)
-        else:
-            decoder, names = Decoder(Z_DIM, 2, 64), []  # an empty list of names marks a baseline
-            model = dict(decoder=decoder)
-            if METHOD == "sectar":
-                model["encoder"] = layers(2 * SKILL_STEPS, 64, 2 * Z_DIM)
-            run = Run(decoder, names, Z_DIM, Z_DIM if METHOD == "dads" else 2, shared, model)
-            dict(dads=train_dads, sectar=train_sectar)[METHOD](run)
-        save(OUT, "policy", EXPERIMENT, SEED, config, actor=run.sac.average, decoder=decoder, method=METHOD,
-             robot=ROBOT, names=names, relation=source["relation"], scale=STEP_SCALE, curve=run.curve,
-             updates=run.sac.updates, env_steps=run.steps * ROBOTS, seconds=run.seconds)
-    policy = SimpleNamespace(**load(OUT, "policy", EXPERIMENT, SEED, **fixed))
-    if policy.names and not torch.equal(policy.decoder.head[2].bias, source["decoder"].head[2].bias):
-        stop(f"the policy has another decoder {DECODER}: train anew, or choose another --out")
+        torch.manual_seed(SEED)
+        train = dict(wedis=train_wedis, dads=train_dads, sectar=train_sectar)[METHOD]
+        policy = train(source["decoder"], source["names"])
+        policy.relation = source["relation"]
+        common.save(OUT, "policy", EXPERIMENT, SEED, config, **vars(policy))  # before it is measured
+    policy = SimpleNamespace(**common.load(OUT, "policy", EXPERIMENT, SEED, **made_with()))
+    same_decoder(policy, source["decoder"])
     measure(policy, source["ranges"])
+    follow_one_skill(policy, source)
     draw_skills(policy)
 
 
-def check_constants(source):
-    """Exits with 2 if constants do not fit one another, or the decoder."""
+# ======== not needed to understand the method
+# -------- what a training needs besides
+
+def check(source):
+    """Exits with 2 if constants do not fit one another, or the decoder of `source`."""
     decoder, names = source["decoder"], source["names"]
     if METHOD not in ("wedis", "dads", "sectar") or ROBOT not in ("ant", "half_cheetah"):
         stop("--method is wedis, dads or sectar; --robot is ant or half_cheetah")
@@ -371,131 +298,294 @@ def check_constants(source):
     if METHOD == "sectar" and Z_DIM < 3 or METHOD == "dads" and BASE_FRAME and Z_DIM != 2:
         stop("SeCTAR needs --z_dim 3 or more; DADS --z_dim 2, or --base_frame false")
     known = names[0] == "speed" and all(name in SINGLE or MULTI.get(name) in names for name in names)
-    if not known or decoder.x_dim != make_robots(1, 1).places:
+    if not known or decoder.x_dim != 1 + (ROBOT == "ant"):
         stop(f"the decoder {DECODER} has axes {' '.join(names)} and predicts {decoder.x_dim} coordinates: "
              f"the {ROBOT} needs another --decoder")
     if weak := [name for name, corr in zip(names, source["abs_corr"]) if corr < 0.5]:
         print(f"the decoder {DECODER} has no latent that means {' or '.join(weak)}")
-    rates = LEARNING_RATE, AVERAGED, SMOOTHING
-    if min(STEP_SCALE, VARIANCE_SCALE, *rates, FLOOR_START, FLOOR_END, Z_RANGE) <= 0:
-        stop("scales, rates, floors and --z_range must be above 0")
-    if DISCOUNT >= 1 or max(RELABELLED, CORRECTED, EXPLORE, AVERAGED, SMOOTHING, DECAY_FROM) > 1:
-        stop("--discount is below 1; shares and rates are at most 1")
-    if EPISODE % SKILL_STEPS or not all(isinstance(n, int) and n > 0 for n in SINGLE_RUN + MULTI_RUN):
-        stop("--skill_steps must divide --episode; --single_run and --multi_run are whole and above 0")
+    if DISCOUNT == 1:
+        stop("--discount must be below 1: no step is terminal, so values would have no bound")
+    if EPISODE % SKILL_STEPS:
+        stop(f"--skill_steps must divide --episode, {EPISODE}")
+    if METHOD == "dads" and SINGLE_RUN[0] * MULTI_RUN[0] > 1:
+        stop("DADS predicts one step: T, the first of --single_run and --multi_run, must be 1")
+    if ROBOTS * WARM_UP == 1:
+        stop("--warm_up must be at least 2: the deviation of the state needs two steps")
+    steps = max(REPLAY, 2 * ROBOTS * SKILL_STEPS)
+    common.need_memory(300 * steps + 50_000 * ROBOTS, "--replay or --robots")  # bytes of a step, of a robot
 
 
-# ======== Baselines: not needed to understand WEDIS
+def made_with():
+    """What must be the same in a policy, or a checkpoint, and in the run that uses it."""
+    made = common.made_by({name: globals()[name] for name in common.types_of(globals())})
+    others = {"ant.xml", "half_cheetah.xml"} - {f"{ROBOT}.xml"}
+    return {name: value for name, value in made.items() if name not in others and name not in MAY_DIFFER}
 
-def train_dads(run):
+
+def same_decoder(policy, decoder):
+    """Exits with 2 if a policy of WEDIS has learnt from another decoder."""
+    if METHOD == "wedis" and not torch.equal(policy.decoder.cell.weight_hh, decoder.cell.weight_hh):
+        stop(f"the policy has learnt from another decoder {DECODER}: train anew without --resume, or choose "
+             "another --out")
+
+
+def start_robots():
+    """ROBOTS robots near the origin, each at another moment of its episode, so that skills change at all
+    times; and the generator of their starts."""
+    robots, rng = common.Robots(common.robot_spec(ROBOT), ROBOTS), np.random.default_rng(SEED)
+    robots.reset(np.arange(ROBOTS), rng)
+    age = rng.integers(0, EPISODE, ROBOTS)
+    if METHOD == "sectar":
+        age -= age % SKILL_STEPS  # together: trajectories are rows of the replay buffer
+    robots.time[:] = age * robots.step_seconds
+    return robots, rng
+
+
+def make_policy(sac, decoder, names, scale):
+    """What 04 needs of a policy, and what the reports measure."""
+    return SimpleNamespace(actor=sac.average, decoder=decoder, names=names, scale=scale, method=METHOD,
+                           robot=ROBOT, relation={}, updates=0, env_steps=0, seconds=0.0, curve=[])
+
+
+class Replay:
+    """The replay buffer R of Alg. 1: a ring of the latest steps of all robots. Fields lie side by side in one
+    table, since a random row is then read at once."""
+
+    def __init__(self, **widths):
+        self.widths, self.added = widths, 0
+        block = ROBOTS * SKILL_STEPS  # at least two skills of all robots
+        self.table = torch.zeros(max(2, REPLAY // block) * block, sum(widths.values()))
+
+    def add(self, unstable, **fields):
+        """One step of all robots: fields (n, width) each. unstable (n,): whose step means nothing."""
+        rows = (self.added + torch.arange(ROBOTS)) % len(self.table)
+        self.table[rows] = torch.cat([fields[name] for name in self.widths], 1)
+        self.table[rows[unstable]] = self.table[rows[unstable] - ROBOTS]  # repeat the robot's step before
+        self.added += ROBOTS
+
+    def read(self, rows):
+        """The fields of rows (..): a namespace of tensors (.., width)."""
+        parts = self.table[rows].split(list(self.widths.values()), -1)
+        return SimpleNamespace(**dict(zip(self.widths, parts)))
+
+    def latest(self, n):
+        """The last n steps, of all robots; at the start zeros."""
+        n = min(n, max(self.added, ROBOTS), len(self.table))
+        return self.read((self.added - n + torch.arange(n)) % len(self.table))
+
+    def sample(self, n, recent=None):
+        """n random steps, of all or of the `recent` latest ones."""
+        filled = min(self.added, len(self.table))
+        back = torch.randint(min(recent or filled, filled), (n,))
+        return self.read((self.added - 1 - back) % len(self.table))
+
+
+class Log:
+    """The clock of a training, its printed lines, learning curve and checkpoints. parts: whatever else has a
+    state_dict. With --resume true it puts everything back where the last checkpoint was."""
+
+    def __init__(self, policy, robots, rng, replay, sac, *parts):
+        self.policy, self.robots, self.rng, self.replay, self.sac = policy, robots, rng, replay, sac
+        self.parts, self.numbers = [sac, sac.critic_adam, sac.actor_adam, *parts], {}
+        path = Path(OUT) / common.artifact_name("policy-checkpoint", EXPERIMENT, SEED)
+        if RESUME and not path.exists():
+            print("there is no checkpoint yet")
+        elif RESUME:
+            self.resume(common.load(OUT, "policy-checkpoint", EXPERIMENT, SEED, **made_with()))
+        self.clock = time.time()
+
+    def step(self):
+        """Once a step: a line, a point of the learning curve and a checkpoint if they are due."""
+        policy = self.policy
+        policy.updates, policy.env_steps = self.sac.updates, self.replay.added
+        if not all(math.isfinite(value) for value in self.numbers.values()):
+            stop(f"a loss is not finite after {policy.updates} updates; lower --learning_rate, or go on from "
+                 "the last good checkpoint with --resume true", code=1)
+        reported = policy.curve[-1]["updates"] if policy.curve else 0
+        if policy.updates < min(UPDATES, reported + UPDATES / REPORTS):
+            return
+        policy.seconds += time.time() - self.clock
+        row = dict(updates=policy.updates, env_steps=policy.env_steps, minutes=policy.seconds / 60,
+                   tracking_error=tracking(policy, False))
+        if METHOD == "wedis":
+            row["tracking_error_closed"] = tracking(policy, True)
+        policy.curve.append(row | {name: float(value) for name, value in self.numbers.items()})
+        left = policy.seconds / 60 * (UPDATES / policy.updates - 1)
+        words = [f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
+                 for name, value in policy.curve[-1].items()]
+        speed = policy.updates / policy.seconds
+        print(*words, f"{speed:.0f} updates/s", f"{left:.1f} min left", sep="  ", flush=True)
+        common.save(OUT, "policy-checkpoint", EXPERIMENT, SEED, made_with(), decoder=policy.decoder,
+                    robots=torch.from_numpy(self.robots.batch.state.copy()), added=self.replay.added,
+                    table=self.replay.table[:self.replay.added].clone(), curve=policy.curve,
+                    scale=policy.scale, updates=policy.updates, seconds=policy.seconds, torch_rng=torch.get_rng_state(),
+                    rng=self.rng.bit_generator.state, parts=[part.state_dict() for part in self.parts])
+        self.clock = time.time()
+
+    def resume(self, saved):
+        same_decoder(SimpleNamespace(**saved), self.policy.decoder)
+        for part, state in zip(self.parts, saved["parts"]):
+            part.load_state_dict(state)
+        self.replay.table[:len(saved["table"])] = saved["table"]
+        self.replay.added, self.sac.updates = saved["added"], saved["updates"]
+        self.robots.batch.state[:] = saved["robots"].numpy()
+        for name in ("curve", "seconds", "scale"):
+            setattr(self.policy, name, saved[name])
+        torch.set_rng_state(saved["torch_rng"])
+        self.rng.bit_generator.state = saved["rng"]
+
+
+# -------- baselines: not needed for WEDIS. Loops as above, with models that are learnt at the same time
+
+def train_dads(_decoder, _names):
     """Sharma et al. 2019: skills z ~ U(-1, 1)^2. The reward is the mutual information of step and z under the
-    skill dynamics q(displacement | z), a Gaussian (theirs: a mixture of four), learnt at the same time. In
-    the base frame z is turned as if it were a displacement."""
+    skill dynamics q(displacement | z), learnt at the same time: a Gaussian (theirs: a mixture of four) of
+    deviation 1 in units of the root mean square of recent displacements, as in their code: a learnt deviation
+    rewards standing still. In the base frame z is turned as if it were a displacement."""
+    robots, rng = start_robots()
+    worker, s_dim, a_dim = ThreadPoolExecutor(1), robots.observe().shape[1], robots.ctrl.shape[1]
+    sac, replay = Sac(s_dim, Z_DIM, a_dim), Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=2, z=Z_DIM)
+    dynamics = Decoder(Z_DIM, 2, 64)
+    adam = torch.optim.Adam(dynamics.parameters(), lr=LEARNING_RATE, fused=True)
+    log = Log(make_policy(sac, dynamics, [], STEP_SCALE), robots, rng, replay, sac, dynamics, adam)
+    z = replay.latest(ROBOTS).z
 
     def log_q(displacement, z):
         """log q up to a constant: displacement (B, 2), own z (B, 2) -> (B,); (B, 1, 2), (L, 2) -> (B, L)."""
-        mean, log_var = (v[:, 0] for v in run.decoder(z, 1))
-        variance = log_var.exp().clamp(min=(FLOOR_END / STEP_SCALE) ** 2)  # or likelihoods have no bound
-        return -0.5 * (variance.log() + (displacement / STEP_SCALE - mean) ** 2 / variance).sum(-1)
+        mean = dynamics(z, 1)[0][:, 0]
+        return -0.5 * ((displacement / log.policy.scale - mean) ** 2).sum(-1)
 
-    @torch.no_grad()
-    def information(displacement, z):
-        """log(L + 1) - log(1 + sum_i exp(log q(.|z_i) - log q(.|z))), (B,); one set of L for the batch."""
-        own = log_q(displacement, z)
-        others = log_q(displacement[:, None], torch.rand(PRIOR_SAMPLES, Z_DIM) * 2 - 1)
-        return math.log(PRIOR_SAMPLES + 1) - (1 + (others - own[:, None]).clamp(-50, 50).exp().sum(1)).log()
+    while sac.updates < UPDATES:
+        over = robots.age() % SKILL_STEPS == 0
+        z = torch.where(over, torch.rand(ROBOTS, Z_DIM) * 2 - 1, z)
+        s = robots.observe()
+        a = sac.actor.act(s, z) if replay.added >= WARM_UP else torch.rand(ROBOTS, a_dim) * 2 - 1
+        physics = worker.submit(robots.step, a.numpy())
+        if THREADS == 1:
+            physics.result()
 
-    while run.sac.updates < UPDATES:
-        run.renew(torch.rand(ROBOTS, Z_DIM) * 2 - 1)
-        run.act(run.z)
-        if run.warm():
-            # from recent steps and their own skills: relabelled ones say nothing about z
-            _, _, _, displacement, z = run.sample(MODEL_BATCH, RECENT)
-            loss = -log_q(displacement, z).mean()
-            run.adam.zero_grad()
-            loss.backward()
-            run.adam.step()
+        if replay.added >= WARM_UP:
+            if sac.updates == 0:
+                sac.normalise(replay.read(slice(0, replay.added)).s)
+            recent = replay.latest(RECENT).displacement
+            log.policy.scale = recent.square().mean().sqrt().clamp(min=1e-4).item()  # the unit, metres a step
+            for _ in range(MODEL_UPDATES):
+                batch = replay.sample(MODEL_BATCH, RECENT)  # relabelled steps would say nothing about z
+                model_loss = -log_q(batch.displacement, batch.z).mean()
+                adam.zero_grad()
+                model_loss.backward()
+                adam.step()
 
-            s, a, s2, displacement, z = run.sample(UPDATES_PER_STEP * BATCH)
-            fresh = torch.rand(len(z), 1) < RELABELLED
-            z = torch.where(fresh, torch.rand(z.shape) * 2 - 1, z)
-            run.learn(s, a, s2, z, z, REWARD_SCALE * information(displacement, z))
-            run.losses["model_loss"] = loss.item()
-        run.collect()
+            batch = replay.sample(UPDATES_PER_STEP * BATCH)
+            fresh = torch.rand(len(batch.z), 1) < RELABELLED
+            batch.z = torch.where(fresh, torch.rand(batch.z.shape) * 2 - 1, batch.z)
+            with torch.no_grad():  # log(L + 1) - log(1 + sum_i exp(log q(.|z_i) - log q(.|z))), L for all
+                own = log_q(batch.displacement, batch.z)
+                others = log_q(batch.displacement[:, None], torch.rand(PRIOR_SAMPLES, Z_DIM) * 2 - 1)
+                ratios = (others - own[:, None]).clamp(-50, 50).exp().sum(1)
+                r = REWARD_SCALE * (math.log(PRIOR_SAMPLES + 1) - (1 + ratios).log())
+            losses = sac.learn(batch, batch.z, batch.z, r)
+            log.numbers = losses | dict(reward=r.mean(), model_loss=model_loss.detach())
+
+        displacement, unstable = physics.result()
+        replay.add(unstable, s=s, a=a, s2=robots.observe(), displacement=displacement, z=z)
+        robots.reset(np.flatnonzero((robots.age()[:, 0].numpy() >= EPISODE) | unstable), rng)
+        log.step()
+    return log.policy
 
 
-def train_sectar(run):
+def train_sectar(_decoder, _names):
     """Co-Reyes et al. 2018: skills z ~ N(0, I); a VAE learns from the trajectories of an explorer, the same
     policy with very long commands. Reward: of a skill, minus the distance between its end and the decoder's;
     of the explorer, how much farther along its command it ends than the VAE's reconstruction."""
-    encoder, decoder = run.model["encoder"], run.decoder
+    robots, rng = start_robots()
+    worker, s_dim, a_dim = ThreadPoolExecutor(1), robots.observe().shape[1], robots.ctrl.shape[1]
+    sac, replay = Sac(s_dim, 2, a_dim), Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=2, z=Z_DIM)
+    vae = nn.ModuleDict(dict(decoder=Decoder(Z_DIM, 2, 64), encoder=layers(2 * SKILL_STEPS, 64, 2 * Z_DIM)))
+    adam = torch.optim.Adam(vae.parameters(), lr=LEARNING_RATE, fused=True)
+    log = Log(make_policy(sac, vae["decoder"], [], STEP_SCALE), robots, rng, replay, sac, vae, adam)
+    z = replay.latest(ROBOTS).z
 
     def elbo(x):
         """x (B, T, 2), trajectory units -> sum_t log p(x_t | z), KL(q || p), (B,), and means (B, T, 2)."""
-        mean, log_var = encoder(x.flatten(1)).chunk(2, 1)  # theirs: a bidirectional LSTM
+        mean, log_var = vae["encoder"](x.flatten(1)).chunk(2, 1)  # theirs: a bidirectional LSTM
         kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1)
-        decoded, variance = decoder(mean + (0.5 * log_var).exp() * torch.randn_like(mean), SKILL_STEPS)
-        variance = variance.exp().clamp(min=(FLOOR_END / STEP_SCALE) ** 2)  # or likelihoods have no bound
+        sampled = mean + (0.5 * log_var).exp() * torch.randn_like(mean)
+        decoded, variance = vae["decoder"](sampled, SKILL_STEPS)
+        variance = variance.exp().clamp(min=(0.01 / STEP_SCALE) ** 2)  # 1 cm, or likelihoods have no bound
         return -0.5 * (variance.log() + (x - decoded) ** 2 / variance).sum((1, 2)), kl, decoded
 
     def trajectories(n, recent):
-        """n random whole trajectories of the `recent` latest steps: s, a, s', displacement, z (n, T, ..)."""
+        """n random whole trajectories of the `recent` latest steps: fields (n, T, width)."""
         block = ROBOTS * SKILL_STEPS
-        done = run.steps // SKILL_STEPS
-        back = torch.randint(max(1, min(done, len(run.replay) // block - 1, recent // block)), (n,))
-        first = (done - 1 - back) % (len(run.replay) // block) * block + torch.randint(ROBOTS, (n,))
-        rows = first[:, None] + ROBOTS * torch.arange(SKILL_STEPS)
-        return run.replay[rows].split(run.widths, 2)
+        done, blocks = replay.added // block, len(replay.table) // block
+        back = torch.randint(max(1, min(done, blocks - 1, recent // block)), (n,))
+        first = (done - 1 - back) % blocks * block + torch.randint(ROBOTS, (n,))
+        return replay.read(first[:, None] + ROBOTS * torch.arange(SKILL_STEPS))
 
-    def steps_of(z, decoded):
+    def commands(z, decoded):
         """Commands (B, T, 2) of skills and explorers alike."""
         return torch.where(z[:, None, -1:] == EXPLORER, z[:, None, :2].expand_as(decoded), decoded)
 
-    while run.sac.updates < UPDATES:
-        z = torch.randn(ROBOTS, Z_DIM)
-        explorers = torch.rand(ROBOTS) < EXPLORE
-        z[explorers, :2] = EXPLORER * nn.functional.normalize(z[explorers, :2])
-        z[explorers, -1] = EXPLORER
-        run.renew(z)
+    while sac.updates < UPDATES:
+        over = torch.tensor(replay.added // ROBOTS % SKILL_STEPS == 0)  # all together
+        explorer = torch.rand(ROBOTS, 1) < EXPLORE
+        along = EXPLORER * nn.functional.normalize(torch.randn(ROBOTS, 2))
+        new = torch.randn(ROBOTS, Z_DIM)
+        marked = torch.cat([along, new[:, 2:-1], torch.full((ROBOTS, 1), EXPLORER)], 1)
+        new = torch.where(explorer, marked, new)
+        z = torch.where(over, new, z)
         with torch.no_grad():
-            commands = steps_of(run.z, decoder(run.z, SKILL_STEPS)[0])
-        run.act(commands[:, run.steps % SKILL_STEPS])
-        if run.warm() and run.steps >= SKILL_STEPS:
-            _, _, _, x, z = trajectories(MODEL_BATCH, RECENT)
-            used = (z[:, 0, -1] == EXPLORER) | (EXPLORE == 0)
-            log_p, kl, _ = elbo(x / STEP_SCALE)
-            loss = ((KL_WEIGHT * kl - log_p) * used).sum() / used.sum().clamp(min=1)
-            run.adam.zero_grad()
-            loss.backward()
-            run.adam.step()
+            command = commands(z, vae["decoder"](z, SKILL_STEPS)[0])[:, replay.added // ROBOTS % SKILL_STEPS]
+        s = robots.observe()
+        a = sac.actor.act(s, command) if replay.added >= WARM_UP else torch.rand(ROBOTS, a_dim) * 2 - 1
+        physics = worker.submit(robots.step, a.numpy())
+        if THREADS == 1:
+            physics.result()
+
+        if replay.added >= max(WARM_UP, ROBOTS * SKILL_STEPS):
+            if sac.updates == 0:
+                sac.normalise(replay.read(slice(0, replay.added)).s)
+            batch = trajectories(MODEL_BATCH, RECENT)
+            used = (batch.z[:, 0, -1] == EXPLORER) | (EXPLORE == 0)
+            log_p, kl, _ = elbo(batch.displacement / STEP_SCALE)
+            model_loss = ((KL_WEIGHT * kl - log_p) * used).sum() / used.sum().clamp(min=1)
+            adam.zero_grad()
+            model_loss.backward()
+            adam.step()
 
             n = max(1, UPDATES_PER_STEP * BATCH // SKILL_STEPS)
-            s, a, s2, x, z = trajectories(n, len(run.replay))
-            x, z = x / STEP_SCALE, z[:, 0]
-            explorer = z[:, -1] == EXPLORER
-            fresh = (torch.rand(n) < RELABELLED) & ~explorer
-            z[fresh] = torch.randn(int(fresh.sum()), Z_DIM)
+            batch = trajectories(n, len(replay.table))
+            x, new = batch.displacement / STEP_SCALE, batch.z[:, 0]
+            explorer = new[:, -1:] == EXPLORER
+            fresh = (torch.rand(n, 1) < RELABELLED) & ~explorer
+            new = torch.where(fresh, torch.randn(n, Z_DIM), new)
             with torch.no_grad():
-                decoded = torch.where(explorer[:, None, None], elbo(x)[2], decoder(z, SKILL_STEPS)[0])
+                decoded = torch.where(explorer[..., None], elbo(x)[2], vae["decoder"](new, SKILL_STEPS)[0])
             # Laplace likelihood of the end. The trap: that of steps is highest for standing still
             error = x - decoded
-            direction = torch.where(explorer[:, None], z[:, :2], -error.sum(1))
+            direction = torch.where(explorer, new[:, :2], -error.sum(1))
             r = REWARD_SCALE * (error * nn.functional.normalize(direction)[:, None]).sum(2)
-            c = steps_of(z, decoded)
+            c = commands(new, decoded)
             c2 = torch.cat([c[:, 1:], c[:, -1:]], 1)
             order = torch.randperm(r.numel())
-            run.learn(*(part.flatten(0, 1)[order] for part in (s, a, s2, c, c2, r)))
-            run.losses["model_loss"] = loss.item()
-        run.collect()
+            flat = SimpleNamespace(**{name: part.flatten(0, 1)[order] for name, part in vars(batch).items()})
+            losses = sac.learn(flat, c.flatten(0, 1)[order], c2.flatten(0, 1)[order], r.flatten()[order])
+            log.numbers = losses | dict(reward=r.mean(), model_loss=model_loss.detach())
 
+        displacement, unstable = physics.result()
+        replay.add(unstable, s=s, a=a, s2=robots.observe(), displacement=displacement, z=z)
+        robots.reset(np.flatnonzero((robots.age()[:, 0].numpy() >= EPISODE) | unstable), rng)
+        log.step()
+    return log.policy
 
-# ======== Measuring and drawing: not needed for WEDIS
+# -------- measuring and drawing
 
-def upside_down(robots):
-    """Which robots have turned over (n,): the torso's z axis points down."""
-    if robots.places == 1:
-        return np.cos(robots.qpos[:, 2]) < 0
-    return (robots.qpos[:, 4:6] ** 2).sum(1) > 0.5  # of its quaternion: 1 - 2 (x^2 + y^2) < 0
+def upside_down(poses):
+    """Which robots have turned over, for poses (.., nq) -> (..) bool: the torso's z axis points down."""
+    if ROBOT != "ant":
+        return np.cos(poses[..., 2]) < 0
+    return (poses[..., 4:6] ** 2).sum(-1) > 0.5  # of its quaternion: 1 - 2 (x^2 + y^2) < 0
 
 
 def traversal(policy, axis, values):
@@ -524,16 +614,14 @@ def grid(policy):
 def roll_out(policy, z, run, closed, noise=None, run_in=0):
     """Execute skills z (n, M) with mean actions, run = (T, H_z): places (n, T * H_z + 1, 2 or 1) in metres.
     From rest, or with noise (a seed) from noisy starts; recorded after run_in steps."""
-    robots = make_robots(len(z), THREADS)
+    robots = common.Robots(common.robot_spec(ROBOT), len(z), THREADS)
     if noise is not None:
         robots.reset(np.arange(len(z)), np.random.default_rng(noise))
     commands = commands_of(policy, z, run[0])
-    for _ in execute(policy, robots, commands[:, :1], run_in, closed, True):
-        pass
-    places = [robots.place()]
-    for _ in execute(policy, robots, commands, run[1], closed, True):
-        places.append(robots.place())
-    return torch.stack(places, 1).numpy()
+    execute(policy, robots, commands[:, :1], run_in, closed, True)
+    start = robots.qpos[None].copy()
+    poses = np.concatenate([start, execute(policy, robots, commands, run[1], closed, True)])
+    return poses[..., :robots.places].swapaxes(0, 1).astype(np.float32)
 
 
 def predicted_path(policy, z, run):
@@ -548,27 +636,34 @@ def tracking(policy, closed):
     z = grid(policy)
     executed = roll_out(policy, z, SINGLE_RUN, closed)[:, -1]
     predicted = predicted_path(policy, z, SINGLE_RUN)[:, -1]
-    return math.sqrt(((executed - predicted) ** 2).sum() / (predicted ** 2).sum())
+    return math.sqrt(((executed - predicted) ** 2).sum() / max((predicted ** 2).sum(), 1e-12))
 
 
 def following(policy, closed):
-    """Following error: three random skills one after another from noisy starts. Returns median and 90 %
-    quantile of |end - sum of commands| of a skill, metres, and the share of robots that ever turn over."""
-    rng = np.random.default_rng(SEED)
-    robots = make_robots(STARTS, THREADS)
+    """Random skills, as a planner draws them, from STARTS noisy starts: three one after another (a baseline:
+    one). Following error: |executed end - end of the commands| of a skill, metres, its median and 90 %; the
+    median against the decoder's free run too, which is what "printed" plans with; the share of robots that
+    ever turn over; the speed, metres a step."""
+    rng, (length, hold) = np.random.default_rng(SEED), MULTI_RUN
+    robots = common.Robots(common.robot_spec(ROBOT), STARTS, THREADS)
     robots.reset(np.arange(STARTS), rng)
-    fallen, away = np.zeros(STARTS, bool), []
-    for _ in range(3):
-        z = torch.from_numpy(rng.uniform(-Z_RANGE, Z_RANGE, (STARTS, len(policy.names)))).float()
+    fallen, away, away_free, speeds = np.zeros(STARTS, bool), [], [], []
+    for _ in range(3 if METHOD == "wedis" else 1):
+        z = torch.from_numpy(rng.uniform(-Z_RANGE, Z_RANGE, (STARTS, len(policy.names) or Z_DIM))).float()
         if "direction" in policy.names:
             z[:, 0].abs_()  # no slow skills, App. A.1.4; on a rail the sign of the speed is the direction
-        commands = commands_of(policy, z, MULTI_RUN[0])
-        predicted = robots.place() + MULTI_RUN[1] * policy.scale * commands.sum(1)
-        for _ in execute(policy, robots, commands, MULTI_RUN[1], closed, True):
-            fallen |= upside_down(robots)
-        away.append((robots.place() - predicted).norm(dim=1).numpy())
+        commands, start = commands_of(policy, z, length), robots.place().numpy()
+        free = predicted_path(policy, z, MULTI_RUN)[:, -1]
+        asked = hold * policy.scale * commands.sum(1).numpy() if METHOD == "wedis" else free
+        poses = execute(policy, robots, commands, hold, closed, True)
+        fallen |= upside_down(poses).any(0)
+        places = np.concatenate([start[None], poses[hold - 1::hold, :, :robots.places]])
+        away.append(np.linalg.norm(places[-1] - start - asked, axis=1))
+        away_free.append(np.linalg.norm(places[-1] - start - free, axis=1))
+        speeds.append(np.linalg.norm(np.diff(places, axis=0), axis=2) / hold)
     return dict(follow_median_m=float(np.median(away)), follow_p90_m=float(np.quantile(away, 0.9)),
-                fall_rate=float(fallen.mean()))
+                follow_decoder_m=float(np.median(away_free)), fall_rate=float(fallen.mean()),
+                speed_m_per_step=float(np.mean(speeds)))
 
 
 def executed_cross_talk(policy, ranges, closed):
@@ -579,23 +674,43 @@ def executed_cross_talk(policy, ranges, closed):
         places = roll_out(policy, z, MULTI_RUN, closed, noise=SEED + 1, run_in=hold)[:, ::hold]
         steps = np.diff(places, axis=1).reshape(NOISY, TRAVERSAL, length, -1).mean(0)
         curves.append(factors_of(steps / (hold * policy.scale), list(ranges)))
-    return cross_talk(curves, ranges)
+    return common.cross_talk(curves, ranges)
 
 
 def measure(policy, ranges):
     """Print and write a row of results/policies.csv. tracking_error, .._open: open loop; others: closed."""
+    made = common.made_by({name: globals()[name] for name in common.types_of(globals())})
     row = dict(experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy.updates,
                env_steps=policy.env_steps, threads=policy.config["THREADS"],
                train_minutes=policy.seconds / 60, tracking_error=tracking(policy, False))
     if METHOD == "wedis":
         row["tracking_error_closed"] = tracking(policy, True)
-        for closed, end in ((False, "_open"), (True, "")):
-            row |= {name + end: value for name, value in following(policy, closed).items()}
+    for closed, end in ((False, "_open"), (True, ""))[:1 + (METHOD == "wedis")]:
+        row |= {name + end: value for name, value in following(policy, closed).items()}
+        if METHOD == "wedis":
             _, purity = executed_cross_talk(policy, ranges, closed)
             row |= {f"purity_{name}{end}": value for name, value in zip(policy.names, purity.tolist())}
     for name, value in row.items():
         print(f"{name:24} {value if isinstance(value, str) else round(value, 3)}")
-    update_csv(Path(OUT) / "results" / "policies.csv", [row], ("experiment", "seed"))
+    made = {name: value for name, value in made.items() if name not in ("OUT", "FIGURE", "TRAIN", "RESUME")}
+    row["settings"] = common.digest(made | dict(policy=policy.sha256))
+    common.update_csv(Path(OUT) / "results" / "policies.csv", [row], ("experiment", "seed", "settings"))
+
+
+def follow_one_skill(policy, source):
+    """The example that all four scripts follow: its command, and a step of the robot after 40 steps of it."""
+    if METHOD != "wedis" or "example" not in source:
+        return
+    z = torch.tensor([source["example"]]) * torch.tensor([float(name in SINGLE) for name in policy.names])
+    with torch.no_grad():
+        mean, log_var = (out[:, 0] for out in policy.decoder(z, 1))
+    places = roll_out(policy, z, (1, 41), True)[0]
+    step = torch.from_numpy(places[-1:] - places[-2:-1])
+    (x, y), (dx, dy) = (policy.scale * mean[0]).tolist(), step[0].tolist()
+    print("one skill, followed: (z_single, 0) =", *(f"{value:.2f}" for value in z[0].tolist()))
+    print(f"  command: the decoder's first displacement times {policy.scale:g}: ({x:.3f}, {y:.3f}) m a step")
+    print(f"  the robot's 41st step with it: ({dx:.3f}, {dy:.3f}) m; reward (Eq. 6) "
+          f"{reward(mean, log_var, step, FLOOR_END).item():.3f}, 0 at best")
 
 
 def draw_skills(policy):
@@ -625,15 +740,15 @@ def draw_skills(policy):
             for line, dots, value, colour in zip(path, marks, values, colours):
                 ax.plot(*line.T, color=colour, lw=1.3, label=f"{value:g}")
                 ax.plot(*dots.T, "o", ms=3 if len(dots) < 10 else 0, color=colour)
-        for ax in axes[:, i]:
-            ax.axis("auto" if rail else "square")  # one scale for the column
+        for ax in axes[:, i]:  # one scale for the column; speeds lie on one line: their y is enlarged
+            ax.axis("auto" if rail or name == "speed" else "square")
         axes[0, i].set_title(f"$z_{{{name}}}$, $T$ = {run[0]}, $H_z$ = {run[1]}")
         axes[-1, i].set_xlabel("x (m)")
     for ax, text in zip(axes[:, 0], rows):
         ax.set_ylabel(f"{text}\n{'latent' if rail else 'y (m)'}")
     handles = axes[0, 0].get_legend_handles_labels()
     figure.legend(*handles, title="transition" if rail else "latent", loc="outside right upper")
-    save_figure(figure, OUT, FIGURE or f"skills_{EXPERIMENT}")
+    common.save_figure(figure, OUT, FIGURE or f"skills_{EXPERIMENT}")
 
 
 if __name__ == "__main__":

@@ -1,23 +1,30 @@
-"""What two or more stages share. Units: trajectory units for decoder displacements (a fast transition is 1),
-metres and radians in the world, `scale` metres per trajectory unit and environment step of 0.05 s.
+"""What two or more stages share: decoder, relation functions, weak labels, robots, actor, execution.
+
+Units: metres, radians, environment steps of 0.05 s. Decoder displacements are in trajectory units: the
+fastest transition of the data is 1. `scale` makes them metres a step (Ant 1/10, Half-Cheetah 1/5; A.1.3).
 """
 import argparse
 import contextlib
 import csv
 import ctypes.util
+import decimal
 import hashlib
 import io
 import json
 import math
 import os
-import re
 import signal
 import sys
+import tokenize
+import typing
 from pathlib import Path
 
 os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend would fail here
 if sys.platform == "linux":  # before mujoco loads: GLFW aborts without a screen
-    os.environ.setdefault("MUJOCO_GL", "egl" if ctypes.util.find_library("EGL") else "disable")
+    LIBRARIES = dict(egl="EGL", osmesa="OSMesa")
+    chosen = os.environ.setdefault("MUJOCO_GL", "egl")
+    if chosen not in ("glfw", "disable", "") and not ctypes.util.find_library(LIBRARIES.get(chosen, chosen)):
+        os.environ["MUJOCO_GL"] = "disable"  # who draws says so
 
 import matplotlib.pyplot as plt
 import mujoco
@@ -27,183 +34,26 @@ from mujoco.batch import Batch
 from torch import nn
 from torch.utils._pytree import tree_leaves
 
+Count = typing.NewType("Count", int)        # a whole number of at least 1 (a plain int: of at least 0)
+Share = typing.NewType("Share", float)      # a number from 0 to 1 (a plain float: of at least 0)
+Positive = typing.NewType("Positive", float)  # a number above 0
+Signed = typing.NewType("Signed", float)    # any number
+
 SINGLE = ("speed", "direction")  # factors of z_single, Sec. 4.2.2
 MULTI = dict(curvature="direction", acceleration="speed")  # factors of z_multi, and what they change in time
 CLASSES = dict(speed=4, direction=4, curvature=3, acceleration=3, x=4, y=4)  # of labels, App. A.1.1, A.3.1
-FRAME_SKIP = 5     # physics steps of 0.01 s per environment step
-FEEDBACK = 0.1     # closed loop: share of the distance to the reference added to a command (the paper: 0)
-CORRECTION = 0.2   # at most so much, trajectory units
-FASTEST = 1.0      # its longest command: much longer ones make falls
-SOFT_START = 20    # environment steps over which the longest command grows from 0.2 to FASTEST
-FORMAT = 3         # of the artifacts; raise it when their meaning changes
+FRAME_SKIP: Count = 5     # physics steps of 0.01 s per environment step
+FEEDBACK: Share = 0.1     # closed loop: share of the distance to the reference that commands gain (paper: 0)
+CORRECTION: float = 0.2   # closed loop: the longest such gain, trajectory units
+FASTEST: Positive = 1.0   # closed loop: the longest command, trajectory units
+SOFT_START: int = 20      # environment steps in which the longest command grows to FASTEST (0: at once)
+SOFT_FROM: Share = 0.2    # ... from this share of FASTEST
+FORMAT = 4                # of the artifacts; raise it when their meaning changes
 HERE = Path(__file__).resolve().parent
 SCRIPT = {"dataset": "01_make_dataset.py", "wetvae": "02_train_wetvae.py", "policy": "03_train_policy.py"}
 
 
-# -------- command line
-
-def stop(message, code=2):
-    """End with one line on stderr. Code 2: the input is wrong; 1: the run failed."""
-    print(f"{Path(sys.argv[0]).name}: {message}", file=sys.stderr)
-    raise SystemExit(code)
-
-
-def convert(value, like, name, least=0):
-    """value (a flag's text, or what a row says) -> the type of `like`. Exits with 2 if it does not fit: whole
-    numbers are at least 1 (seeds and ports 0), others at least `least`."""
-    kind, text = type(like), str(value).lower()
-    if kind is str:
-        return str(value)
-    if kind is bool and text in ("true", "false"):
-        return text == "true"
-    if kind is tuple:
-        parts = value if isinstance(value, (tuple, list)) else text.split()
-        if len(parts) == len(like):
-            likes = [0.0 if "." in str(part) else one for part, one in zip(parts, like)]
-            return tuple(convert(part, one, name, -1e9) for part, one in zip(parts, likes))
-    if kind is int and least == 0 and not name.lower().endswith(("seed", "seeds", "port")):
-        least = 1
-    with contextlib.suppress(ValueError):
-        number = float(text)
-        if kind in (int, float) and least <= number < math.inf and number == kind(number):
-            return kind(number)
-    bound = f" of at least {least}" * (least >= 0)
-    kinds = {bool: "true or false", int: f"a whole number{bound}, like {like} in the file",
-             float: f"a number{bound}", tuple: f"{np.size(like)} numbers"}
-    stop(f"{name} is {value!r}, but must be {kinds[kind]}")
-
-
-def parse_flags(stage, argv=None):
-    """Make each `NAME = value # comment` at the top of a stage (its globals()) a flag --name, and set it. A
-    row of EXPERIMENTS overrides it, a flag both. Returns {NAME: value}, and the flags' alone."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop("stopped; 02 and 03 go on with --resume true", 1))
-    if hasattr(signal, "SIGPIPE"):
-        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # piped into head
-    parser = argparse.ArgumentParser(description=stage["__doc__"], allow_abbrev=False,
-                                     argument_default=argparse.SUPPRESS,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.error = lambda message: stop(f"{message}; see --help")
-    likes, source = {}, Path(stage["__file__"]).read_text(encoding="utf-8")
-    for name, text, comment in re.findall(r"^([A-Z_]+) = (.*?)(?:  +# (.*))?$", source, re.MULTILINE):
-        like = stage[name]
-        if isinstance(like, float) and like.is_integer() and "." not in text:
-            like = int(like)  # 1e4, 512 / 2
-        if isinstance(like, (bool, int, float, str, tuple)):
-            likes[name] = like
-            parser.add_argument("--" + name.lower(), dest=name, metavar=type(like).__name__,
-                                help=f"{comment} [{like}]".replace("%", "%%"))
-    given = vars(parser.parse_args(argv))
-    experiment, rows = given.get("EXPERIMENT", stage["EXPERIMENT"]), stage["EXPERIMENTS"]
-    if experiment not in rows:
-        stop(f"unknown experiment {experiment!r}; allowed: {' '.join(rows)}")
-    if unknown := set(rows[experiment]) - set(stage):
-        stop(f"{' '.join(unknown)} in the row {experiment!r} of EXPERIMENTS is no constant of this file")
-    stage.update(rows[experiment] | given)
-    config = {name: convert(stage[name], like, "--" + name.lower()) for name, like in likes.items()}
-    stage.update(config)
-    write_whole(Path(stage["OUT"]) / f".can_write_{os.getpid()}", b"").unlink()  # before any work is lost
-    return config, {name: config[name] for name in given}
-
-
-# -------- artifacts and CSV
-
-def write_whole(path, data):
-    """Write bytes to path, whole or not at all, under a name that no other process uses. Returns path."""
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(partial, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())  # or a power cut may leave an empty file
-        os.replace(partial, path)  # atomic
-    except OSError as error:
-        stop(f"cannot write {path}: {error.strerror}; free the space or choose another --out", code=1)
-    finally:  # left by a full disk, or by whoever stops the program
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
-    return path
-
-
-def artifact_name(kind, experiment, seed):
-    return f"{kind}_{experiment}_seed{seed}" + (".npz" if kind == "dataset" else ".pt")
-
-
-def save(out, kind, experiment, seed, config, **content):
-    """Write an artifact, then the 32 bytes of its SHA-256. content: arrays (dataset), or tensors, plain
-    values and networks. Returns its path."""
-    meta = dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed, config=config,
-                versions=dict(torch=str(torch.__version__), mujoco=mujoco.__version__, numpy=np.__version__))
-    buffer = io.BytesIO()
-    if kind == "dataset":
-        np.savez(buffer, meta=json.dumps(meta), **content)
-    else:
-        networks = {name: part for name, part in content.items() if isinstance(part, nn.Module)}
-        for name, net in networks.items():  # as plain values: reading a file must not run code
-            content[name] = dict(network=type(net).__name__, arguments=net.arguments, state=net.state_dict())
-        torch.save(meta | content, buffer)
-    data, path = buffer.getvalue(), Path(out) / artifact_name(kind, experiment, seed)
-    return write_whole(path, data + hashlib.sha256(data).digest())
-
-
-def load(out, kind, experiment, seed, **same):
-    """Read an artifact from <out>/, else pretrained/, and say which. Returns its content and "sha256". Exits
-    with 2 if it is missing, damaged, foreign, not finite, or made with other constants than those of same."""
-    name = artifact_name(kind, experiment, seed)
-    row = f"{experiment} or its beginning" if kind == "wetvae" else experiment  # 02: <row>_<model>
-    make = f"make it with: python {SCRIPT[kind.partition('-')[0]]} --seed {seed} --experiment {row}"
-    paths = [path for path in (Path(out) / name, HERE / "pretrained" / name) if path.exists()]
-    if not paths:
-        stop(f"no {name} in {out}/ or pretrained/; {make}")
-    path, data = paths[0], paths[0].read_bytes()
-    if hashlib.sha256(data[:-32]).digest() != data[-32:]:
-        stop(f"{path} is damaged or is no artifact of this project; {make}")
-    if kind == "dataset":
-        content = dict(np.load(io.BytesIO(data), allow_pickle=False))
-        content |= json.loads(str(content.pop("meta")))
-    else:
-        content = torch.load(io.BytesIO(data[:-32]), weights_only=True)
-    made = content["config"] | content
-    for key, value in (dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed) | same).items():
-        if made.get(key) != value:
-            stop(f"{path} has {key} = {made.get(key)}, not {value}: give the same, or {make}")
-    numbers = [np.asarray(leaf) for leaf in tree_leaves(content) if not isinstance(leaf, str)]
-    if not all(np.isfinite(leaf).all() for leaf in numbers if leaf.dtype.kind == "f"):
-        stop(f"{path} holds numbers that are not finite; {make}")
-    for name, part in content.items():
-        if isinstance(part, dict) and "network" in part:
-            network = dict(Decoder=Decoder, Actor=Actor)[part["network"]](*part["arguments"])
-            network.load_state_dict(part["state"])
-            content[name] = network.requires_grad_(False)
-    print(f"using {path.relative_to(HERE) if path.is_relative_to(HERE) else path}")
-    return content | dict(sha256=data[-32:].hex())
-
-
-def update_csv(path, rows, key):
-    """Write rows (dicts), in place of those in the file that agree with one of them on the columns in key."""
-    new = [{k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in row.items()} for row in rows]
-    replaced = {tuple(row[k] for k in key) for row in new}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(f"{path}.lock", "w") as lock:  # seeds trained side by side share a file
-        if os.name == "posix":  # Windows has no fcntl
-            import fcntl
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        old = read_csv(path) if path.exists() else []
-        rows = [row for row in old if tuple(row.get(k) for k in key) not in replaced] + new
-        text = io.StringIO()
-        columns = dict.fromkeys(name for row in rows for name in row)
-        writer = csv.DictWriter(text, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        write_whole(path, text.getvalue().encode())
-
-
-def read_csv(path):
-    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
-
-
-# -------- weak labels and factors
+# -------- weak labels, App. A.1.1
 
 def weak_labels(factors, names, ranges):
     """Weak labels, App. A.1.1, A.3.1, Fig 9: factors {name: (N,)}, ranges {name: (low, high)} -> (N, M) int64
@@ -214,58 +64,17 @@ def weak_labels(factors, names, ranges):
             labels.append(np.sign(factors[name]).astype(int) % 3)  # 0, 1, 2
         else:
             labels.append(np.digitize(factors[name], np.linspace(*ranges[name], CLASSES[name] + 1)[1:-1]))
-        if name == "direction":  # the first class has the largest angles
+        if name == "direction":  # the paper's first class has the largest angles
             labels[-1] = CLASSES[name] - 1 - labels[-1]
     return np.stack(labels, 1)
 
 
-def factors_of(displacement, names):
-    """The factors in names of trajectories: displacement (N, T, 2 or 1) -> {name: (N,)}. Speed: the mean
-    (with acceleration: the first), on a rail with a sign; direction: the first, radians; curvature: radians
-    per transition; x, y: the mean; acceleration: per transition, as a share of the speed."""
-    turns = max(displacement.shape[1] - 1, 1)
-    size = np.linalg.norm(displacement, axis=2) if displacement.shape[2] == 2 else displacement[..., 0]
-    found = dict(speed=size.mean(1))
-    if "acceleration" in names:
-        found["speed"] = size[:, 0]
-        gain = (size[:, -1] - size[:, 0]) / turns * np.sign(size[:, 0])
-        found["acceleration"] = gain / np.maximum(abs(size[:, 0]), 0.1)
-    if displacement.shape[2] == 2:
-        heading = np.unwrap(np.arctan2(displacement[..., 1], displacement[..., 0]))
-        found["direction"], found["curvature"] = heading[:, 0], (heading[:, -1] - heading[:, 0]) / turns
-        found["x"], found["y"] = displacement.mean(1).T
-    return {name: found[name] for name in names}
-
-
-def spread(values, name):
-    """Range of a factor's values (n,); for directions, which are on a circle, 2 pi less the largest gap."""
-    if name != "direction":
-        return np.ptp(values)
-    angles = np.sort(values % (2 * math.pi))
-    return 2 * math.pi - np.diff(angles, append=angles[0] + 2 * math.pi).max()
-
-
-def cross_talk(curves, ranges):
-    """Cross-talk C (axes, factors): range of factor j along axis i / its range in the data, and the purity of
-    each axis, C[i, i] / sum_j C[i, j], or nan if it is dead, its whole row below 0.1. curves: for each axis
-    the factors {name: (n,)} along its traversal; ranges: {name: (low, high)}."""
-    C = np.array([[spread(curve[name], name) / np.ptp(limits) for name, limits in ranges.items()]
-                  for curve in curves])
-    return C, np.where(C.max(1) < 0.1, math.nan, C.diagonal() / C.sum(1).clip(1e-9))
-
-
-# -------- decoder, robot, actor, execution
-
-def layers(n_in, hidden, n_out):
-    """Two hidden layers with ReLU."""
-    return nn.Sequential(nn.Linear(n_in, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
-                         nn.Linear(hidden, n_out))
-
+# -------- the decoder p_theta(tau | z), Fig 1
 
 class Decoder(nn.Module):
     """p_theta(tau | z), Fig 1: an LSTM over z and its own last mean -> a Gaussian over the next displacement.
     The trap: a decoder that reads the true last displacement needs no z, and z stays entangled. circle: index
-    of a latent that is an angle, a whole turn from -1.5 to 1.5."""
+    of a latent that is an angle, a whole turn from -1.5 to 1.5; None: there is none."""
 
     def __init__(self, z_dim, x_dim, hidden, circle=None):
         super().__init__()
@@ -273,67 +82,85 @@ class Decoder(nn.Module):
         self.x_dim, self.circle = x_dim, circle
         self.cell = nn.LSTMCell(x_dim + z_dim + (circle is not None), hidden)
         self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2 * x_dim))
-        self.register_buffer("axes", torch.eye(z_dim))  # canonical z -> latents: a signed permutation
+        self.register_buffer("axes", torch.eye(z_dim))  # z -> latents: a signed permutation, set in stage 02
 
     def forward(self, z, steps):
-        """unroll for canonical z (B, M): axis m is factor m, + is more of it. z_single is (z_single, 0)."""
-        return self.unroll(z @ self.axes[:z.shape[1]], steps)
+        """Skills z (B, M): axis m is factor m, and + is more of it. Returns what decode_latents returns."""
+        return self.decode_latents(z @ self.axes, steps)
 
-    def unroll(self, z, steps):
-        """Latents z of training (B, M) -> mean and log-variance of displacements, (B, steps, x_dim) each."""
-        i = self.circle
-        if i is not None:
-            z = torch.cat([z[:, :i], on_circle(z[:, i]), z[:, i + 1:]], 1)
-        mean, state, out = z.new_zeros(len(z), self.x_dim), None, []
+    def decode_latents(self, latents, steps):
+        """Latents (B, M), in the order and with the signs that training found -> mean and log-variance of the
+        displacements, (B, steps, x_dim) each, trajectory units."""
+        latents = with_circle(latents, self.circle)
+        mean, state, out = latents.new_zeros(len(latents), self.x_dim), None, []
         for _ in range(steps):
-            state = self.cell(torch.cat([mean, z], 1), state)
+            state = self.cell(torch.cat([mean, latents], 1), state)
             out.append(self.head(state[0]))
             mean = out[-1][:, :self.x_dim]
         return torch.stack(out, 1).chunk(2, 2)
 
 
-def on_circle(z):
-    """Angle latents (B,), of which 3 is a whole turn -> cosine and sine (B, 2)."""
-    return torch.stack([(z * 2 * math.pi / 3).cos(), (z * 2 * math.pi / 3).sin()], 1)
+def with_circle(latents, circle):
+    """Latents (B, M) as networks read them: the angle with index `circle`, of which 3 is a whole turn, as its
+    cosine and sine (B, M + 1)."""
+    if circle is None:
+        return latents
+    return torch.cat([latents[:, :circle], on_circle(latents[:, circle]), latents[:, circle + 1:]], 1)
 
+
+def on_circle(angle):
+    """Angle latents (B,), of which 3 is a whole turn -> cosine and sine (B, 2)."""
+    return torch.stack([(angle * 2 * math.pi / 3).cos(), (angle * 2 * math.pi / 3).sin()], 1)
+
+
+# -------- relation functions and commands, Sec. 4.2.2
 
 def next_skill(z, names, relation):
-    """The relation functions f, Sec. 4.2.2, 6.1.2, A.3.2: z (..., M) of one transition -> of the next. names
+    """The relation functions f, Sec. 4.2.2, 6.1.2, A.3.2: z (B, M) of one transition -> of the next. names
     of the axes; relation {factor of z_multi: weight} (the paper: -0.2, -0.1 by hand, for its axes)."""
     z = z.clone()
     for factor, weight in relation.items():
-        change = weight * z[..., names.index(factor)]
-        target = z[..., names.index(MULTI[factor])]  # a view
+        change = weight * z[:, names.index(factor)]
+        changed = z[:, names.index(MULTI[factor])]  # a view: += below writes into z
         if factor == "acceleration" and "direction" not in names:
-            change = change * target.sign()  # f_speed of App. A.3.2: on a rail a speed has a sign
-        target += change  # f_dir or f_speed
+            change = change * changed.sign()  # f_speed of App. A.3.2: on a rail a speed has a sign
+        changed += change  # f_dir or f_speed
     return z
 
 
 @torch.no_grad()
 def commands_of(policy, z, steps):
-    """The commands of skills z (B, M): (B, `steps`, c_dim) in trajectory units. WEDIS: first steps of the
-    decoder for z_single, with relation functions in between; SeCTAR: its decoder's steps; DADS: z itself."""
+    """The commands of skills z (B, M): (B, steps, c_dim), trajectory units. WEDIS: the decoder's first step
+    for (z_single, 0), with the relation functions in between. SeCTAR: its decoder's steps. DADS: z itself."""
     if policy.method == "dads":
         return z[:, None].expand(-1, steps, -1)
-    if not policy.names:
+    if policy.method == "sectar":
         return policy.decoder(z, steps)[0]
-    singles = []
+    is_single = torch.tensor([float(name in SINGLE) for name in policy.names])
+    single_steps = []
     for _ in range(steps):
-        singles.append(z[:, :sum(name in SINGLE for name in policy.names)])
-        z = next_skill(z, policy.names, policy.relation)
-    mean, _ = policy.decoder(torch.cat(singles), 1)
+        single_steps.append(z * is_single)  # (z_single, 0)
+        z = next_skill(z, policy.names, policy.relation)  # Alg. 2, lines 17 and 18
+    mean, _ = policy.decoder(torch.cat(single_steps), 1)
     return mean.view(steps, len(z), -1).transpose(0, 1)
+
+
+# -------- robots
+
+def robot_spec(robot):
+    """The model of a robot, "ant" or "half_cheetah", to be compiled."""
+    return mujoco.MjSpec.from_file(str(HERE / "robots" / f"{robot}.xml"))
 
 
 class Robots:
     """n robots of one model (ant.xml: nq 15, nv 14, nu 8; half_cheetah.xml: 9, 9, 6) that step together on
     threads; equal to a loop over mj_step. In the plane a robot has the places x and y, on a rail x alone."""
 
-    def __init__(self, spec, n, threads=2):
+    def __init__(self, spec, n, threads=1):
         model = spec.compile()
         self.batch = Batch(model, n, threads)
         self.places = 2 if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE else 1
+        self.step_seconds = FRAME_SKIP * model.opt.timestep
         self.qpos, self.qvel, self.ctrl, self.time = map(self.batch.bind, ("qpos", "qvel", "ctrl", "time"))
         self.reset(np.arange(n))
 
@@ -352,15 +179,21 @@ class Robots:
         """The policy's state, App. A.1.3: qpos without the place, qvel. (n, 27), Half-Cheetah (n, 17)."""
         return torch.from_numpy(np.concatenate([self.qpos[:, self.places:], self.qvel], 1)).float()
 
+    def age(self):
+        """Environment steps since each robot's reset, (n, 1)."""
+        return torch.from_numpy(np.rint(self.time / self.step_seconds)).float()[:, None]
+
     def step(self, action):
-        """One environment step of 0.05 s. action (n, nu) in [-1, 1]. Returns displacement (n, 2 or 1) in
-        metres, and which robots were unstable since their reset (n,): their displacement means nothing."""
+        """One environment step. action (n, nu) in [-1, 1]. Returns displacement (n, 2 or 1) in metres, and
+        which robots were unstable since their reset (n,): their displacement means nothing."""
         before = self.qpos[:, :self.places].copy()
         self.ctrl[:] = action
         self.batch.step(nstep=FRAME_SKIP)
         unstable = self.batch.warning.any((1, 2))
         return torch.from_numpy(self.qpos[:, :self.places] - before).float(), unstable
 
+
+# -------- the skill policy pi_psi(a | s, c), Sec. 4.2.1
 
 def rotate(v, angle):
     """Vectors (B, 2) turned counter-clockwise by angle (B,)."""
@@ -376,6 +209,12 @@ def to_base_frame(s, c):
     tilt, velocity = rotate(s[:, 2:4], -half), rotate(s[:, 13:15], -2 * half)
     body = s[:, 5:13], velocity, s[:, 15:]  # the angular velocity is the torso's own already
     return torch.cat([s[:, :1], upright, tilt, *body], 1), rotate(c, -2 * half)
+
+
+def layers(n_in, hidden, n_out):
+    """Two hidden layers with ReLU, App. A.1.3."""
+    return nn.Sequential(nn.Linear(n_in, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
+                         nn.Linear(hidden, n_out))
 
 
 class Actor(nn.Module):
@@ -414,28 +253,291 @@ class Actor(nn.Module):
         return self(self.inputs(s, c), deterministic)[0]
 
 
+# -------- execution of skills, Alg. 2, lines 13 to 19
+
 def closed_loop(c, reference, robots, scale):
     """Commands (n, 2 or 1), trajectory units: c and a share of reference - place, both in metres."""
-    share = FEEDBACK * (2 - c.norm(dim=1, keepdim=True).clamp(max=1))  # slow commands: up to twice as much
-    correction = share * (reference - robots.place()) / scale
-    c = c + correction * (CORRECTION / correction.norm(dim=1, keepdim=True).clamp(min=CORRECTION))
-    steps = torch.from_numpy(robots.time).float()[:, None] / 0.05  # since the last reset
-    longest = (0.2 + (FASTEST - 0.2) * steps / SOFT_START).clamp(max=FASTEST)
-    return c * (longest / torch.maximum(c.norm(dim=1, keepdim=True), longest))
+    share = FEEDBACK * (2 - c.norm(dim=1, keepdim=True).clamp(max=1))  # slow commands gain up to twice it
+    gain = share * (reference - robots.place()) / scale
+    c = c + gain * (CORRECTION / gain.norm(dim=1, keepdim=True).clamp(min=CORRECTION or 1.0))
+    started = (robots.age() / SOFT_START).clamp(max=1) if SOFT_START else 1.0
+    longest = torch.full_like(c[:, :1], FASTEST) * (SOFT_FROM + (1 - SOFT_FROM) * started)
+    return c * (longest / torch.maximum(c.norm(dim=1, keepdim=True), longest).clamp(min=1e-9))
 
 
 def execute(policy, robots, commands, hold, closed, deterministic):
-    """Alg. 2, lines 13-19: hold each command (n, T, c_dim) for `hold` (H_z) steps. Yields after each step."""
-    reference = robots.place()
+    """Alg. 2, lines 13 to 19: hold each command (n, T, c_dim) for `hold` (H_z) steps. closed: closed loop, in
+    which a reference advances by the command. Returns the poses after each step, (T * hold, n, nq)."""
+    reference, poses, ever_unstable = robots.place(), [], False
     for c in commands.unbind(1):
         for _ in range(hold):
-            asked = closed_loop(c, reference, robots, policy.scale) if closed else c
-            yield robots.step(policy.actor.act(robots.observe(), asked, deterministic).numpy())
-            if closed:
-                reference = reference + policy.scale * c
+            command = closed_loop(c, reference, robots, policy.scale) if closed else c
+            _, unstable = robots.step(policy.actor.act(robots.observe(), command, deterministic).numpy())
+            reference = reference + policy.scale * c if closed else reference
+            poses.append(robots.qpos.copy())
+            ever_unstable |= unstable
+    if np.any(ever_unstable):
+        print(f"{np.sum(ever_unstable)} of {len(robots.qpos)} simulations were unstable: these robots began "
+              "anew at the origin")
+    return np.stack(poses) if poses else np.zeros((0, *robots.qpos.shape))
+
+
+# ======== not needed to understand the method
+
+# -------- factors of trajectories, and how purely an axis means one
+
+def factors_of(displacement, names):
+    """The factors in names of trajectories: displacement (N, T, 2 or 1) -> {name: (N,)}. Speed: the mean
+    (with acceleration: the first), on a rail with a sign; direction: the first, radians; curvature: radians
+    per transition; x, y: the mean; acceleration: per transition, as a share of the speed."""
+    turns = max(displacement.shape[1] - 1, 1)
+    size = np.linalg.norm(displacement, axis=2) if displacement.shape[2] == 2 else displacement[..., 0]
+    found = dict(speed=size.mean(1))
+    if "acceleration" in names:
+        found["speed"] = size[:, 0]
+        gain = (size[:, -1] - size[:, 0]) / turns * np.sign(size[:, 0])
+        found["acceleration"] = gain / np.maximum(abs(size[:, 0]), 0.1)
+    if displacement.shape[2] == 2:
+        heading = np.unwrap(np.arctan2(displacement[..., 1], displacement[..., 0]))
+        found["direction"], found["curvature"] = heading[:, 0], (heading[:, -1] - heading[:, 0]) / turns
+        found["x"], found["y"] = displacement.mean(1).T
+    return {name: found[name] for name in names}
+
+
+def spread(values, name):
+    """Range of a factor's values (n,); for directions, which are on a circle, 2 pi less the largest gap."""
+    if name != "direction":
+        return np.ptp(values)
+    angles = np.sort(values % (2 * math.pi))
+    return 2 * math.pi - np.diff(angles, append=angles[0] + 2 * math.pi).max()
+
+
+def cross_talk(curves, ranges):
+    """Cross-talk C (axes, factors): range of factor j along axis i / its range in the data, and the purity of
+    each axis, C[i, i] / sum_j C[i, j], or nan if it is dead, its whole row below 0.1. curves: for each axis
+    the factors {name: (n,)} along its traversal; ranges: {name: (low, high)}."""
+    C = np.array([[spread(curve[name], name) / np.ptp(limits) for name, limits in ranges.items()]
+                  for curve in curves])
+    return C, np.where(C.max(1) < 0.1, math.nan, C.diagonal() / C.sum(1).clip(1e-9))
+
+
+# -------- flags
+
+def stop(message, code=2):
+    """End with one line on stderr. Code 2: the input is wrong; 1: the run failed."""
+    print(f"{Path(sys.argv[0]).name}: {message}", file=sys.stderr)
+    raise SystemExit(code)
+
+
+KINDS = {  # declared types: what is allowed, in words, and as (least, most)
+    Count: ("a whole number of at least 1", 1, 2 ** 63 - 1),
+    int: ("a whole number of at least 0, below 2 ** 63", 0, 2 ** 63 - 1),
+    float: ("a number of at least 0", 0, 1e300), Positive: ("a number above 0", 1e-300, 1e300),
+    Share: ("a number from 0 to 1", 0, 1), Signed: ("a number", -1e300, 1e300), bool: ("true or false",)}
+
+
+def convert(value, kind, name):
+    """A flag's text, or what a file or a row says, as its declared type. Exits with 2 if it does not fit."""
+    text = str(value).strip()
+    if kind is str:
+        return text
+    if kind is bool and text.lower() in ("true", "false", "1", "0"):
+        return text.lower() in ("true", "1")
+    if typing.get_origin(kind) is tuple:
+        parts, kinds = text.replace(",", " ").strip("()[] ").split(), typing.get_args(kind)
+        wanted = len(kinds)
+        if kinds[-1] is Ellipsis:  # one or more
+            kinds, wanted = kinds[:1] * len(parts), max(len(parts), 1)
+        if len(parts) != wanted:
+            stop(f"{name} is {value!r}, but must be {wanted} numbers, as in \"{' '.join('1' * wanted)}\"")
+        return tuple(convert(part, one, name) for part, one in zip(parts, kinds))
+    if kind is not bool:
+        with contextlib.suppress(decimal.InvalidOperation):  # exact: a float would round a long seed
+            number, (_, least, most) = decimal.Decimal(text), KINDS[kind]
+            whole = getattr(kind, "__supertype__", kind) is int
+            if number.is_finite() and least <= number <= most and not (whole and number % 1):
+                return int(number) if whole else float(number)
+    stop(f"{name} is {value!r}, but must be {KINDS[kind][0]}")
+
+
+def types_of(module):
+    """{NAME: type} of the constants with a declared type. Python 3.14 keeps them as a function."""
+    return module.get("__annotations__") or module["__annotate__"](1)
+
+
+def parse_flags(stage, argv=None):
+    """Make each constant with a declared type, `NAME: type = value  # comment`, at the top of a stage (its
+    globals()) a flag --name, and set it. A row of EXPERIMENTS overrides the file, a flag both. Returns
+    {NAME: value}, and the flags' alone. Exits with 2, in one line, if a name or a value does not fit."""
+    again = "; --resume true goes on from the last checkpoint" if "RESUME" in stage else ""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop("stopped" + again, 1))
+    if hasattr(signal, "SIGPIPE"):
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # piped into head
+    declared = types_of(stage)
+    kinds = {name: declared.get(name, type(value)) for name, value in stage.items()
+             if name.isupper() and name not in globals()
+             and (name in declared or isinstance(value, (bool, int, float, str)))}
+    parser = argparse.ArgumentParser(description=stage["__doc__"], allow_abbrev=False,
+                                     argument_default=argparse.SUPPRESS,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.error = lambda message: stop(f"{message}; see --help")
+    with open(stage["__file__"], "rb") as file:  # comments, for --help alone
+        comments = {token.line.replace("=", ":").partition(":")[0].strip(): token.string.lstrip("# ")
+                    for token in tokenize.tokenize(file.readline) if token.type == tokenize.COMMENT}
+    for name in kinds:
+        text = f"{comments.get(name, '')} [{stage[name]}]".replace("%", "%%")
+        parser.add_argument("--" + name.lower(), dest=name, metavar="VALUE", help=text)
+    arguments = []
+    for word in sys.argv[1:] if argv is None else argv:
+        if word.startswith("-") and word[1:2] in tuple("0123456789.") and arguments:
+            arguments[-1] += "=" + word  # a negative number is no flag
+        else:
+            arguments.append(word)
+    given = vars(parser.parse_args(arguments))
+    row = {}
+    if "EXPERIMENTS" in stage:
+        experiment, rows = given.get("EXPERIMENT", stage["EXPERIMENT"]), stage["EXPERIMENTS"]
+        if experiment not in rows:
+            stop(f"unknown experiment {experiment!r}; allowed: {' '.join(rows)}")
+        row = rows[experiment]
+        if unknown := set(row) - set(kinds):
+            stop(f"{' '.join(unknown)} in the row {experiment!r} of EXPERIMENTS is no constant of this file")
+    values = {name: stage[name] for name in kinds} | row | given
+    config = {name: convert(values[name], kind, "--" + name.lower()) for name, kind in kinds.items()}
+    stage.update(config)
+    for name, kind in types_of(globals()).items():  # common.py's own
+        globals()[name] = convert(globals()[name], kind, f"{name} in common.py")
+    write_whole(Path(stage["OUT"]) / f".can_write_{os.getpid()}", b"").unlink()  # before any work is lost
+    return config, {name: config[name] for name in given}
+
+
+def need_memory(size, mend):
+    """Exits with 2 if the machine has fewer than `size` bytes of memory. mend: what to make smaller."""
+    if hasattr(os, "sysconf") and size > os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"):
+        stop(f"this needs {size / 1e9:.3g} GB of memory, more than this machine has: lower {mend}")
+
+
+# -------- artifacts and CSV
+
+def made_by(config):
+    """All that makes a result: a stage's constants, common.py's, and the robots' files."""
+    own = {name: globals()[name] for name in types_of(globals())}
+    files = {path.name: hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+             for path in sorted((HERE / "robots").glob("*.xml"))}
+    return config | dict(CLASSES=CLASSES) | own | files
+
+
+def digest(values):
+    """Eight hexadecimal digits that stand for {name: value}."""
+    return hashlib.sha256(repr(sorted(values.items())).encode()).hexdigest()[:8]
+
+
+def write_whole(path, data):
+    """Write bytes to path, whole or not at all, under a name that no other process uses. Returns path."""
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(partial, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())  # or a power cut may leave an empty file
+        os.replace(partial, path)  # atomic
+    except OSError as error:
+        stop(f"cannot write {path}: {error.strerror}; free the space or choose another --out", code=1)
+    finally:  # left by a full disk, or by whoever stops the program
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+    return path
+
+
+def artifact_name(kind, experiment, seed):
+    return f"{kind}_{experiment}_seed{seed}" + (".npz" if kind == "dataset" else ".pt")
+
+
+def save(out, kind, experiment, seed, config, **content):
+    """Write an artifact, then the 32 bytes of its SHA-256. content: arrays (dataset), or tensors, plain
+    values and networks. Returns its path."""
+    meta = dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed, config=made_by(config),
+                versions=dict(torch=str(torch.__version__), mujoco=mujoco.__version__, numpy=np.__version__))
+    buffer = io.BytesIO()
+    if kind == "dataset":
+        np.savez(buffer, meta=json.dumps(meta), **content)
+    else:
+        networks = {name: part for name, part in content.items() if isinstance(part, nn.Module)}
+        for name, net in networks.items():  # as plain values: reading a file must not run code
+            content[name] = dict(network=type(net).__name__, arguments=net.arguments, state=net.state_dict())
+        torch.save(meta | content, buffer)
+    data, path = buffer.getvalue(), Path(out) / artifact_name(kind, experiment, seed)
+    return write_whole(path, data + hashlib.sha256(data).digest())
+
+
+def load(out, kind, experiment, seed, **same):
+    """Read an artifact from <out>/, else pretrained/, and say which. Returns its content and "sha256". Exits
+    with 2 if it is missing, damaged, foreign, not finite, or made with other constants than those of same."""
+    name, kind_of_stage = artifact_name(kind, experiment, seed), kind.partition("-")[0]
+    make = f"make it with: python {SCRIPT[kind_of_stage]} --seed {seed} --experiment {experiment}"
+    paths = [path for path in (Path(out) / name, HERE / "pretrained" / name) if path.exists()]
+    if not paths:
+        stop(f"no {name} in {out}/ or pretrained/; {make}")
+    path, data = paths[0], paths[0].read_bytes()
+    if hashlib.sha256(data[:-32]).digest() != data[-32:]:
+        stop(f"{path} is damaged or is no artifact of this project; {make}")
+    if kind == "dataset":
+        content = dict(np.load(io.BytesIO(data), allow_pickle=False))
+        content |= json.loads(str(content.pop("meta")))
+    else:
+        content = torch.load(io.BytesIO(data[:-32]), weights_only=True)
+    made = content["config"] | content
+    for key, value in (dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed) | same).items():
+        if made.get(key) != value:
+            stop(f"{path} was made with {key} = {made.get(key)}, not {value}: set {key} back, or {make}")
+    numbers = [np.asarray(leaf) for leaf in tree_leaves(content) if not isinstance(leaf, str)]
+    if not all(np.isfinite(leaf).all() for leaf in numbers if leaf.dtype.kind == "f"):
+        stop(f"{path} holds numbers that are not finite; {make}")
+    for name, part in content.items():
+        if isinstance(part, dict) and "network" in part:
+            network = dict(Decoder=Decoder, Actor=Actor)[part["network"]](*part["arguments"])
+            network.load_state_dict(part["state"])
+            content[name] = network.requires_grad_(False)
+    print(f"using {path.relative_to(HERE) if path.is_relative_to(HERE) else path}")
+    return content | dict(sha256=data[-32:].hex())
+
+
+def update_csv(path, rows, key):
+    """Write rows (dicts), in place of those in the file that agree with one of them on the columns in key."""
+    new = [{k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in row.items()} for row in rows]
+    replaced = {tuple(row[k] for k in key) for row in new}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(f"{path}.lock", "w") as lock:  # seeds trained side by side share a file
+        with contextlib.suppress(ImportError):  # Windows has no fcntl
+            import fcntl
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            except OSError as error:
+                print(f"{path} is not locked ({error.strerror}): let no other run write it now")
+        old = read_csv(path) if path.exists() else []
+        rows = [row for row in old if tuple(row.get(k) for k in key) not in replaced] + new
+        text = io.StringIO()
+        columns = dict.fromkeys(name for row in rows for name in row)
+        writer = csv.DictWriter(text, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        write_whole(path, text.getvalue().encode())
+
+
+def read_csv(path):
+    """The rows of a table (dicts of text). Exits with 2 if a spreadsheet has saved it in another form."""
+    with contextlib.suppress(UnicodeDecodeError):
+        text = path.read_text(encoding="utf-8-sig")  # with or without a byte order mark
+        rows = list(csv.DictReader(text.splitlines()))
+        if all(len(row) > 1 and None not in row and None not in row.values() for row in rows):
+            return rows
+    stop(f"{path} is no table with commas in UTF-8 any more: save it so, or move it away")
 
 
 BLUE, RED, GREY = "#0072B2", "#D55E00", "#888888"
+plt.rcdefaults()  # a reader's matplotlibrc may ask for TeX
 plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
                      "grid.alpha": 0.25, "figure.dpi": 110, "savefig.bbox": "tight", "legend.frameon": False,
                      "axes.titlesize": 10, "figure.constrained_layout.use": True})

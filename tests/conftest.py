@@ -16,8 +16,7 @@ import torch
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
-import common  # before mujoco
-import mujoco
+import common
 
 torch.set_num_threads(1)
 S1, S2, S3, S4 = "01_make_dataset", "02_train_wetvae", "03_train_policy", "04_mpc_maze"
@@ -31,7 +30,7 @@ def script(name):
 
 
 def robot_spec(name):
-    return mujoco.MjSpec.from_file(str(ROOT / f"{name}.xml"))
+    return common.robot_spec(name)
 
 
 def load_policy(out, experiment, seed):
