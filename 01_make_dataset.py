@@ -1,9 +1,8 @@
 """Stage 1: factors -> trajectories (App. A.1.1, Table 1, Fig 9).
 
-Draws the factors of interest (speed, direction, curvature; in other experiments acceleration) and makes of
-each draw a trajectory of T transitions from the origin.
-In: nothing. Out, below runs/: a figure, and dataset_<experiment>_seed<seed>.npz with trajectories (N, T + 1,
-2 or 1), factors (N, M), their names (M,) and ranges (M, 2), angles in radians. Takes 5 seconds.
+Draws the factors of interest and makes of each draw a trajectory of T transitions from the origin. Writes,
+below runs/, a figure and dataset_<experiment>_seed<seed>.npz with trajectories (N, T + 1, 2 or 1), factors
+(N, M), their names (M,) and ranges (M, 2), angles in radians. Takes 5 seconds.
 Expect, n = 100,000: a mean speed of 0.50, and 20 % of the trajectories straight.
 """
 import math
@@ -11,22 +10,22 @@ import math
 import numpy as np
 
 import common
-from common import parse_flags, plt, save, save_figure, stop, weak_labels
+from common import Count, Degrees, Positive, Share, plt, stop, weak_labels
 
-EXPERIMENT = "main"     # row of EXPERIMENTS below
-SEED = 0                # random seed
-OUT = "runs"            # folder of all that is written
-FIGURE = ""             # name of the figure, if there are direction and curvature ("": dataset_<experiment>)
+EXPERIMENT: str = "main"      # row of EXPERIMENTS below
+SEED: int = 0                 # random seed of the whole chain: data, decoder, policy
+OUT: str = "runs"             # folder of all that is written
+FIGURE: str = ""              # name of the figure, if factors have one ("": dataset_<experiment>)
 
-TRAJECTORIES = 100_000  # N, App. A.1.1
-LENGTH = 5              # T, transitions per trajectory
-FACTORS = "speed direction curvature"  # without direction trajectories have one dimension
-SPEED_LOW = 0.0         # speed ~ U(SPEED_LOW, SPEED_HIGH), Table 1, trajectory units per transition
-SPEED_HIGH = 1.0        # in one dimension ~ U(-SPEED_HIGH, SPEED_HIGH)
-DIRECTION = 90.0        # direction ~ U(-DIRECTION, DIRECTION), degrees: the right-sided semicircle
-CURVATURE = 30.0        # curvature ~ U(-CURVATURE, CURVATURE), degrees per transition; + turns left
-ACCELERATION = 0.2      # acceleration ~ U(-ACCELERATION, ACCELERATION) times the speed per transition
-STRAIGHT = 0.2          # probability that the curvature is exactly 0; ours: the same for the acceleration
+TRAJECTORIES: Count = 100_000  # N, App. A.1.1
+LENGTH: Count = 5             # T, transitions per trajectory
+FACTORS: str = "speed direction curvature"  # without direction trajectories have one dimension
+SPEED_LOW: float = 0.0        # speed ~ U(SPEED_LOW, SPEED_HIGH), Table 1, trajectory units per transition
+SPEED_HIGH: Positive = 1.0    # in one dimension ~ U(-SPEED_HIGH, SPEED_HIGH)
+DIRECTION: Degrees = 90.0     # direction ~ U(-DIRECTION, DIRECTION), degrees: the right-sided semicircle
+CURVATURE: Degrees = 30.0     # curvature ~ U(-CURVATURE, CURVATURE), degrees per transition; + turns left
+ACCELERATION: float = 0.2     # acceleration ~ U(-ACCELERATION, ACCELERATION) times the speed per transition
+STRAIGHT: Share = 0.2         # probability that the curvature is exactly 0; ours: of the acceleration too
 
 EXPERIMENTS = {  # a row names the constants in which an experiment differs
     "main": dict(FIGURE="fig09_dataset"),
@@ -49,25 +48,8 @@ def make_trajectories(speed, direction=None, curvature=0.0, acceleration=0.0, le
     return np.pad(steps.cumsum(1), ((0, 0), (1, 0), (0, 0)))  # s_0 is fixed at the origin, Sec. 4.1
 
 
-def check(names, limits):
-    """End with one line if these constants make no data set from which the factors can be learnt."""
-    if "speed" not in names or not set(names) <= set(limits):
-        stop(f"--factors {FACTORS!r} must name speed, and besides it only {' '.join(limits)}")
-    if SPEED_LOW and "direction" not in names:
-        stop("--speed_low needs direction in --factors: in one dimension speeds go both ways, from 0 on")
-    if max(DIRECTION, CURVATURE) > 180:
-        stop("--direction and --curvature must be at most 180")
-    for name in names:
-        if limits[name][0] >= limits[name][1] or name in common.MULTI and (STRAIGHT >= 1 or LENGTH == 1):
-            stop(f"{name} is the same in all trajectories: widen its range, or leave it out of --factors")
-    if "curvature" in names and "direction" not in names:
-        stop("--factors with curvature needs direction too: one dimension has no turns")
-    if "acceleration" in names and ACCELERATION * (LENGTH - 1) >= 1:
-        stop(f"--acceleration must be less than {1 / (LENGTH - 1):.3g}, or the last transitions go back")
-
-
 def main():
-    config, _ = parse_flags(globals())
+    config, _ = common.parse_flags(globals())
     slowest = SPEED_LOW if "direction" in FACTORS.split() else -SPEED_HIGH
     limits = dict(speed=(slowest, SPEED_HIGH), direction=(-DIRECTION, DIRECTION),
                   curvature=(-CURVATURE, CURVATURE), acceleration=(-ACCELERATION, ACCELERATION))
@@ -82,20 +64,44 @@ def main():
             factors[name] *= rng.random(TRAJECTORIES) >= STRAIGHT
     trajectories = make_trajectories(**factors, length=LENGTH)  # Alg. 1, "Generate"
     ranges = {name: unit[name] * np.array(limits[name]) for name in names}
-    path = save(OUT, "dataset", EXPERIMENT, SEED, config, trajectories=trajectories.astype(np.float32),
-                factors=np.stack(list(factors.values()), 1).astype(np.float32), names=np.array(names),
-                ranges=np.array(list(ranges.values())))
-
-    print(f"Table 1, as drawn: {TRAJECTORIES} trajectories of T = {LENGTH} in {trajectories.shape[2]}D")
-    print("factor        distribution              mean      min      max   exactly 0")
-    suffix = dict(speed="", direction=" deg", curvature=" deg", acceleration=" x speed")
+    path = common.save(OUT, "dataset", EXPERIMENT, SEED, config, trajectories=trajectories.astype(np.float32),
+                       factors=np.stack(list(factors.values()), 1).astype(np.float32),
+                       names=np.array(names), ranges=np.array(list(ranges.values())))
+    print(f"wrote {path}\nTable 1, as drawn: {TRAJECTORIES} trajectories of T = {LENGTH}; angles in degrees")
     for name, values in factors.items():
-        text, shown = "U({:g}, {:g})".format(*limits[name]) + suffix[name], values / unit[name]
-        print(f"{name:13s} {text:22s} {shown.mean():8.3f} {shown.min():8.3f} {shown.max():8.3f}   "
-              f"{np.mean(values == 0):.3f}")
-    print(f"wrote {path}")
-    if "direction" in names and "curvature" in names:
+        shown, zero = values / unit[name], np.mean(values == 0)
+        print(f"{name:12}  U{limits[name]!s:16}  mean {shown.mean():.3f}  min {shown.min():.3f}  "
+              f"max {shown.max():.3f}  exactly 0: {zero:.3f}")
+    if names[:3] == ["speed", "direction", "curvature"]:
+        follow_one_skill(ranges)
         draw(trajectories[:4000], {name: values[:4000] for name, values in factors.items()}, ranges)
+
+
+# ======== not needed to understand the method
+
+def check(names, limits):
+    """End with one line if these constants make no data set from which the factors can be learnt."""
+    two = "direction" in names or not (SPEED_LOW or "curvature" in names)
+    if "speed" not in names or not set(names) <= set(limits) or not two:
+        stop(f"--factors {FACTORS!r} must name speed, and besides it only {' '.join(limits)}; curvature and "
+             "--speed_low need direction: one dimension has neither turns nor a least speed")
+    for name in names:
+        if name in common.MULTI and LENGTH == 1:
+            stop(f"{name} needs --length 2 or more: it is a change from one transition to the next")
+        if name in common.MULTI and STRAIGHT == 1 or limits[name][0] >= limits[name][1]:
+            stop(f"{name} never changes: widen its range, lower --straight, or leave it out of --factors")
+    if "acceleration" in names and ACCELERATION * (LENGTH - 1) >= 1:
+        stop(f"--acceleration must be less than {1 / (LENGTH - 1):.3g}, or the last transitions go back")
+    common.need_memory(100 * TRAJECTORIES * (LENGTH + 1), "--trajectories or --length")
+
+
+def follow_one_skill(ranges):
+    """The example that all four scripts follow."""
+    factors = dict(speed=np.array([0.6]), direction=np.radians([20.0]), curvature=np.radians([-10.0]))
+    points = make_trajectories(**factors, length=LENGTH)[0]
+    print("one skill, followed: speed 0.6, direction 20 degrees, curvature -10 degrees a transition")
+    print("  its points:", *(f"({x:.2f}, {y:.2f})" for x, y in points), " its labels:",
+          *weak_labels(factors, list(factors), ranges)[0] + 1)
 
 
 def draw(trajectories, factors, ranges):
@@ -120,7 +126,7 @@ def draw(trajectories, factors, ranges):
     for path, label in zip(trajectories[:300], curvature):
         data.plot(*path.T, color=colours[label], lw=0.6, alpha=0.7)
     data.set(title="trajectories of the data set", xlabel="x (trajectory units)", aspect="equal")
-    save_figure(figure, OUT, FIGURE or f"dataset_{EXPERIMENT}")
+    common.save_figure(figure, OUT, FIGURE or f"dataset_{EXPERIMENT}")
 
 
 if __name__ == "__main__":

@@ -184,23 +184,6 @@ def floor_at(progress):
 
 # -------- SAC (Haarnoja et al. 2017), App. A.1.3
 
-class Critics(nn.Module):
-    """Q_1 and Q_2 side by side, as batched matrix products: faster than two. (B, n), (B, m) -> (2, B)."""
-
-    def __init__(self, n_in):
-        super().__init__()
-        networks = [layers(n_in, HIDDEN, 1)[::2] for _ in range(2)]  # their linear layers
-        pairs = list(zip(*networks))
-        self.weights = nn.ParameterList(torch.stack([a.weight.T, b.weight.T]).detach() for a, b in pairs)
-        self.biases = nn.ParameterList(torch.stack([a.bias, b.bias])[:, None].detach() for a, b in pairs)
-
-    def forward(self, x, a):
-        h = torch.cat([x, a], 1).expand(2, -1, -1)
-        h = torch.relu(torch.baddbmm(self.biases[0], h, self.weights[0]))
-        h = torch.relu(torch.baddbmm(self.biases[1], h, self.weights[1]))
-        return (h * self.weights[2].mT).sum(2) + self.biases[2].squeeze(2)
-
-
 class Sac(nn.Module):
     """Actor psi, twin critics, value and target network, with a fixed temperature. average: the policy,
     a running average of the actor's weights."""
@@ -209,7 +192,7 @@ class Sac(nn.Module):
         super().__init__()
         self.actor = Actor(s_dim, c_dim, a_dim, HIDDEN, BASE_FRAME)
         n_in = self.actor.net[0].in_features
-        self.critics = Critics(n_in + a_dim)
+        self.critics = nn.ModuleList(layers(n_in + a_dim, HIDDEN, 1) for _ in range(2))
         self.value = layers(n_in, HIDDEN, 1)
         self.target = copy.deepcopy(self.value).requires_grad_(False)
         self.average = copy.deepcopy(self.actor).requires_grad_(False)
@@ -240,18 +223,19 @@ class Sac(nn.Module):
         r (b,)."""
         with torch.no_grad():
             q_target = r + DISCOUNT * self.target(x2).squeeze(1)
-        q = self.critics(x, a)
-        q_loss = 0.5 * ((q - q_target) ** 2).mean(1).sum()
+        q1, q2 = (critic(torch.cat([x, a], 1)).squeeze(1) for critic in self.critics)
+        q_loss = 0.5 * ((q1 - q_target) ** 2 + (q2 - q_target) ** 2).mean()
         self.critic_adam.zero_grad()
         q_loss.backward()
         self.critic_adam.step()
         self.updates += 1
-        self.losses |= dict(q=q.detach().mean(), q_loss=q_loss.detach())
+        self.losses |= dict(q=q1.detach().mean(), q_loss=q_loss.detach())
         if self.updates % ACTOR_EVERY:
             return
         a_new, log_prob = self.actor(x)
         self.critics.requires_grad_(False)  # or backward computes their gradients too
-        q_new = self.critics(x, a_new).min(0).values
+        q1, q2 = (critic(torch.cat([x, a_new], 1)).squeeze(1) for critic in self.critics)
+        q_new = torch.minimum(q1, q2)
         self.critics.requires_grad_(True)
         actor_loss = (TEMPERATURE * log_prob - q_new).mean()
         v_loss = 0.5 * ((self.value(x).squeeze(1) - (q_new - TEMPERATURE * log_prob).detach()) ** 2).mean()
@@ -418,7 +402,8 @@ class Log:
         common.save(OUT, "policy-checkpoint", EXPERIMENT, SEED, made_with(), decoder=policy.decoder,
                     robots=torch.from_numpy(self.robots.batch.state.copy()), added=self.replay.added,
                     table=self.replay.table[:self.replay.added].clone(), curve=policy.curve,
-                    scale=policy.scale, updates=policy.updates, seconds=policy.seconds, torch_rng=torch.get_rng_state(),
+                    scale=policy.scale, updates=policy.updates, seconds=policy.seconds,
+                    torch_rng=torch.get_rng_state(),
                     rng=self.rng.bit_generator.state, parts=[part.state_dict() for part in self.parts])
         self.clock = time.time()
 

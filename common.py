@@ -37,6 +37,7 @@ from torch.utils._pytree import tree_leaves
 Count = typing.NewType("Count", int)        # a whole number of at least 1 (a plain int: of at least 0)
 Share = typing.NewType("Share", float)      # a number from 0 to 1 (a plain float: of at least 0)
 Positive = typing.NewType("Positive", float)  # a number above 0
+Degrees = typing.NewType("Degrees", float)  # a number from 0 to 180
 Signed = typing.NewType("Signed", float)    # any number
 
 SINGLE = ("speed", "direction")  # factors of z_single, Sec. 4.2.2
@@ -333,7 +334,8 @@ KINDS = {  # declared types: what is allowed, in words, and as (least, most)
     Count: ("a whole number of at least 1", 1, 2 ** 63 - 1),
     int: ("a whole number of at least 0, below 2 ** 63", 0, 2 ** 63 - 1),
     float: ("a number of at least 0", 0, 1e300), Positive: ("a number above 0", 1e-300, 1e300),
-    Share: ("a number from 0 to 1", 0, 1), Signed: ("a number", -1e300, 1e300), bool: ("true or false",)}
+    Share: ("a number from 0 to 1", 0, 1), Degrees: ("a number from 0 to 180", 0, 180),
+    Signed: ("a number", -1e300, 1e300), bool: ("true or false",)}
 
 
 def convert(value, kind, name):
