@@ -385,7 +385,7 @@ def parse_flags(stage, argv=None):
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.error = lambda message: stop(f"{message}; see --help")
     with open(stage["__file__"], "rb") as file:  # comments, for --help alone
-        comments = {token.line.replace("=", ":").partition(":")[0].strip(): token.string.lstrip("# ")
+        comments = {token.line.replace("=", ":").partition(":")[0].rstrip(): token.string.lstrip("# ")
                     for token in tokenize.tokenize(file.readline) if token.type == tokenize.COMMENT}
     for name in kinds:
         text = f"{comments.get(name, '')} [{stage[name]}]".replace("%", "%%")

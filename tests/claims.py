@@ -1,7 +1,7 @@
-"""The claims of Sec. 6.2.1 and Table 2, from the rows of figure 7: python tests/claims.py [flags of 04_mpc_maze.py].
+"""The claims of Sec. 6.2.1 and Table 2, from the rows of 04: python tests/claims.py [--out FOLDER]
 
-Reads <OUT>/results/figure7.csv, as made by 04_mpc_maze.py --experiment figure7 with the same flags, and writes
-claims.csv and table2.csv beside it. Rows made with other settings are left out.
+Reads <OUT>/results/figure7.csv and matched.csv, as made by 04_mpc_maze.py --experiment figure7 and matched, and writes
+claims.csv and table2.csv beside them. `--out .` judges what is shipped; tests/report.py --ship does the same.
 """
 import importlib
 import sys
@@ -12,75 +12,92 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 import common  # noqa: E402
 import numpy as np  # noqa: E402
 
-OTHERS = ["wedis_s", "wedis_nts", "dads"]  # SeCTAR is compared in the last claim alone: it counts once
+PLANNED = ("maze", "reward", "method", "mode", "look_ahead", "samples", "policy_seed")  # names a run's rows of 04
+RIVALS = ("dads", "dads_speed", "sectar")  # planned as printed alone
+ABLATIONS = ("wedis_s", "wedis_nts")
+OTHERS = (*ABLATIONS, *RIVALS[:2])  # SeCTAR is compared in the last claim alone: it counts once
 CLAIMS = {  # words -> (better, its N, worse, its N)
     "WEDIS shows the outstanding results for all the cases": [("wedis", 1000, m, 1000) for m in OTHERS],
     "... even with less planning samples": [("wedis", 100, m, 1000) for m in OTHERS],
-    "WEDIS-S and DADS are superior than WEDIS-NTS": [(m, 1000, "wedis_nts", 1000) for m in ("wedis_s", "dads")],
-    "WEDIS-S outperforms DADS": [("wedis_s", 1000, "dads", 1000)],
+    "WEDIS-S and DADS are superior than WEDIS-NTS": [(m, 1000, "wedis_nts", 1000) for m in ("wedis_s", *RIVALS[:2])],
+    "WEDIS-S outperforms DADS": [("wedis_s", 1000, m, 1000) for m in RIVALS[:2]],
     "SeCTAR has poor performance": [(m, 1000, "sectar", 1000) for m in ["wedis", *OTHERS]],
 }
+EQUAL = {"(ours) WEDIS ends nearer at equal look-ahead": [("wedis", 1000, m, 1000) for m in ABLATIONS]}  # matched.csv
 VERDICTS = ("holds", "undecided", "does not hold")
 
 
-def comparisons(rows, stage):
+def latest(rows, key):
+    """Of rows that agree on key those with the settings that were written last: a table holds one setting."""
+    last = {tuple(row[k] for k in key): row.get("settings") for row in rows}
+    return [row for row in rows if row.get("settings") == last[tuple(row[k] for k in key)]]
+
+
+def verdict_of(low, high):
+    """Of a comparison, by the 95 % interval of how much nearer the better method ends."""
+    return "holds" if low > 0 else "does not hold" if high < 0 else "undecided"
+
+
+def comparisons(rows, stage, claims=CLAIMS, equal=False):
     """Every comparison of each claim in each panel of Fig 7, as rows: by how many metres the better method ends nearer,
-    with its 95 % interval over policies and trials. It holds if all of that is above 0, does not hold if all is below.
-    mode is that of the better method; the worse one is as printed."""
-    rng, found = np.random.default_rng(0), []
-    panels = dict.fromkeys((row["maze"], row["reward"]) for row in rows)
-    for words, mode, (maze, kind) in product(CLAIMS, ("printed", "closed"), panels):
-        for better, n_better, worse, n_worse in CLAIMS[words]:
-            panel = dict(column="final_distance", maze=maze, reward=kind)
-            a = stage.values_of(rows, method=better, samples=n_better, mode=mode, **panel)
-            b = stage.values_of(rows, method=worse, samples=n_worse, mode="printed", **panel)
+    with its 95 % interval over policies and trials. Both methods are in the same mode where both have it: rivals are
+    as printed. equal: only runs that look equally far ahead are compared."""
+    rng, found, rows = np.random.default_rng(0), [], latest(rows, PLANNED)
+    panels = dict.fromkeys((row["maze"], row["reward"], *([row["look_ahead"]] if equal else [])) for row in rows)
+    for words, mode, panel in product(claims, ("printed", "commands"), panels):
+        where = dict(zip(("maze", "reward", "look_ahead"), panel))
+        for better, n_better, worse, n_worse in claims[words]:
+            if mode != "printed" and {better, worse} <= set(RIVALS):
+                continue  # the same comparison as in printed
+            a, b = (stage.values_of(rows, "final_distance", method=method, samples=n, **where,
+                                    mode="printed" if method in RIVALS else mode)
+                    for method, n in ((better, n_better), (worse, n_worse)))
             if not (a.size and b.size):
                 continue
             gain = stage.resampled_means(b, rng) - stage.resampled_means(a, rng)
             low, high = np.quantile(gain, [0.025, 0.975])
-            verdict = "undecided"
-            if low > 0:
-                verdict = "holds"
-            elif high < 0:
-                verdict = "does not hold"
-            found.append(dict(claim=words, mode=mode, maze=maze, reward=kind, better=better, better_samples=n_better,
-                              worse=worse, worse_samples=n_worse, difference=b.mean() - a.mean(), low=low, high=high,
-                              verdict=verdict, better_policies=len(a), worse_policies=len(b), trials=a.shape[1]))
+            found.append(dict(claim=words, against="rivals" if {better, worse} & set(RIVALS) else "ablations", mode=mode)
+                         | dict(look_ahead="") | where | dict(
+                better=better, better_samples=n_better, worse=worse, worse_samples=n_worse, difference=b.mean() - a.mean(),
+                low=low, high=high, verdict=verdict_of(low, high), better_policies=len(a), worse_policies=len(b),
+                trials=a.shape[1]))
     return found
 
 
-def counts(found):
-    """Per claim and mode: how many comparisons hold, are undecided, do not hold."""
-    lines = []
-    for words, mode in dict.fromkeys((row["claim"], row["mode"]) for row in found):
-        mine = [row["verdict"] for row in found if (row["claim"], row["mode"]) == (words, mode)]
-        lines.append(dict(claim=words, mode=mode) | {verdict: mine.count(verdict) for verdict in VERDICTS})
-    return lines
+def in_words(verdicts):
+    """The verdict of a claim about all its cases, with how many comparisons hold and how many do not."""
+    hold, undecided, not_hold = map(verdicts.count, VERDICTS)
+    word = "does not hold" if not_hold else "undecided" if undecided or not hold else "holds"
+    return f"{word} ({hold} of {len(verdicts)} hold" + (f", {not_hold} do not" if not_hold else "") + ")"
 
 
-def table2(units):
-    """Table 2, as rows, from the settings that the planner uses."""
-    return [dict(method=u.method, episode_steps=u.episode, hold=u.hold, length=u.length,
-                 steps_per_skill=u.hold * u.length, skills_dense=u.planned,
-                 skills_sparse=u.episode // (u.hold * u.length),  # to the end of the episode
-                 z_range=u.z_range, slowest_speed=0.0 if "wedis" in u.method else -u.z_range)
-            for u in {u.method: u for u in units}.values()]
+def table2(stage, config):
+    """Table 2, as rows, from the constants that the planner uses."""
+    rows = []
+    for method, row in stage.METHODS.items():
+        c = {c.reward: c for c in stage.configurations_of(method, "maze1", (), config | row)}
+        dense = c["dense"]
+        rows.append(dict(method=method, episode_steps=dense.episode, hold=dense.hold, length=dense.length,
+                         steps_per_skill=dense.hold * dense.length, skills_dense=dense.planned,
+                         skills_sparse=c["sparse"].planned, z_range=dense.z_range,
+                         slowest_speed=-dense.z_range if method in RIVALS else 0.0))
+    return rows
 
 
-def main(stage):
-    units = stage.units_of(*common.parse_flags(vars(stage), ["--experiment", "figure7", *sys.argv[1:]]))
-    folder, present = Path(stage.OUT) / "results", {u.settings for u in units}
-    path = folder / f"{stage.EXPERIMENT}.csv"
-    if not path.exists():
-        common.stop(f"no {path}; make it with: python 04_mpc_maze.py --experiment figure7")
-    found = comparisons([row for row in common.read_csv(path) if row.get("settings") in present], stage)
+def main(stage, argv):
+    config, _ = common.parse_flags(vars(stage), ["--experiment", "figure7", *argv])
+    folder = Path(stage.OUT) / "results"
+    figure7, matched = (common.read_csv(path) if path.exists() else [] for path in
+                        (folder / "figure7.csv", folder / "matched.csv"))
+    found = comparisons(figure7, stage) + comparisons(matched, stage, EQUAL, equal=True)
     if not found:
-        common.stop(f"{path} holds nothing to compare with the present settings")
-    common.update_csv(folder / "claims.csv", found, tuple(found[0])[:8])
-    common.update_csv(folder / "table2.csv", table2(units), ("method",))
-    for line in counts(found):
-        print(" | ".join(map(str, line.values())))
+        common.stop(f"{folder}/figure7.csv holds nothing to compare: python 04_mpc_maze.py --experiment figure7")
+    common.update_csv(folder / "claims.csv", found, ())  # no column: all rows are replaced
+    common.update_csv(folder / "table2.csv", table2(stage, config), ())
+    for claim in dict.fromkeys((row["claim"], row["against"], row["mode"]) for row in found):
+        print(*claim, in_words([row["verdict"] for row in found if (row["claim"], row["against"], row["mode"]) == claim]),
+              sep=" | ")
 
 
 if __name__ == "__main__":
-    main(importlib.import_module("04_mpc_maze"))
+    main(importlib.import_module("04_mpc_maze"), sys.argv[1:])

@@ -4,6 +4,7 @@ import importlib.util
 import itertools
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,7 +24,7 @@ S1, S2, S3, S4 = "01_make_dataset", "02_train_wetvae", "03_train_policy", "04_mp
 
 
 def script(name):
-    spec = importlib.util.spec_from_file_location("stage_" + name[:2], ROOT / f"{name}.py")
+    spec = importlib.util.spec_from_file_location("stage_" + Path(name).name[:2], ROOT / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -59,6 +60,8 @@ TINY = dict(updates=24, robots=8, skill_steps=5, episode=20, warm_up=80, replay=
 
 def tiny(out, **changed):
     """The flags of a tiny training in the folder out."""
+    if changed.get("experiment") == "ant_dads":  # it predicts one step
+        changed = dict(multi_run="1 4") | changed
     return [text for name, value in (TINY | changed | dict(out=out)).items() for text in (f"--{name}", str(value))]
 
 
@@ -77,11 +80,19 @@ def out(tmp_path):
 
 
 @pytest.fixture
+def tree(tmp_path, monkeypatch):
+    """A copy of robots/, used in place of ours."""
+    shutil.copytree(ROOT / "robots", tmp_path / "tree/robots")
+    monkeypatch.setattr(common, "HERE", tmp_path / "tree")
+    return tmp_path / "tree"
+
+
+@pytest.fixture
 def inside(monkeypatch, capsys):
     """inside(stage, *flags) runs a stage's main in this process, without pictures: exit code, stdout, stderr."""
     def run(stage, *flags):
         monkeypatch.setattr(sys, "argv", [stage.__file__, *map(str, flags)])
-        monkeypatch.setattr(stage, "save_figure", lambda figure, *_: common.plt.close(figure), raising=False)
+        monkeypatch.setattr(common, "save_figure", lambda figure, *_: common.plt.close(figure))
         code, constants = 0, {name: value for name, value in vars(stage).items() if name.isupper()}
         try:
             stage.main()
@@ -92,6 +103,45 @@ def inside(monkeypatch, capsys):
         printed = capsys.readouterr()
         return SimpleNamespace(returncode=code, stdout=printed.out, stderr=printed.err)
     return run
+
+
+def one_pass(stage, monkeypatch, train, fill=lambda replay: None, prepare=lambda log: None, passes=1):
+    """`passes` steps of a training loop of stage 3 without SAC: what the last one hands to Sac.learn (batch, c, c2, r),
+    what was stored before it, the state of torch's random numbers where the first one began to learn, and its Log.
+    fill(replay) stores steps, prepare(log) changes what was just made."""
+    done = SimpleNamespace(batch=None, left=passes)
+
+    class Replay(stage.Replay):
+        def __init__(self, **widths):
+            super().__init__(**widths)
+            fill(self)
+
+    class Log:
+        def __init__(self, policy, robots, rng, replay, sac, *parts):
+            self.policy, self.robots, self.replay, self.sac, self.parts = policy, robots, replay, sac, parts
+            self.numbers, done.log = {}, self
+            prepare(self)
+
+        def step(self):
+            done.left -= 1
+            if not done.left:
+                self.sac.updates = stage.UPDATES
+
+    def learn(sac, batch, c, c2, r):
+        done.batch, done.c, done.c2, done.r = batch, c, c2, r
+        return {}
+
+    def normalise(sac, s):
+        done.random = torch.get_rng_state()
+        kept = min(done.log.replay.added, len(done.log.replay.table))
+        done.stored = SimpleNamespace(**{name: part.clone() for name, part in
+                                         vars(done.log.replay.read(slice(0, kept))).items()})
+    for name, value in dict(Replay=Replay, Log=Log).items():
+        monkeypatch.setattr(stage, name, value)
+    for name, value in dict(learn=learn, normalise=normalise).items():
+        monkeypatch.setattr(stage.Sac, name, value)
+    train()
+    return done
 
 
 def one_line(done, *codes):

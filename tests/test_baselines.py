@@ -2,185 +2,190 @@
 torch.distributions and plain loops.
 Their trainings from the command line, and that these resume with the same bits: test_policy.py."""
 import math
-from types import SimpleNamespace
 
-import common
 import pytest
 import torch
+from conftest import one_pass
 from torch import distributions as D
-
-
-def gaussian(q, z):
-    """q(. | z) by torch.distributions, in trajectory units; its deviation is at least 1 cm."""
-    mean, log_var = (v.detach()[:, 0] for v in q(z, 1))
-    return D.Independent(D.Normal(mean, (0.5 * log_var).exp().clamp(min=0.1)), 1)
-
-
-class Sac:
-    """Keeps the batches that it is given; its inputs are state and command side by side."""
-    actor = SimpleNamespace(inputs=lambda s, c: torch.cat([s, c], 1))
-
-    def __init__(self):
-        self.updates, self.batches = 0, []
-        self.critic_adam = self.actor_adam = SimpleNamespace(param_groups=[])
-
-    def update(self, x, a, x2, r):
-        self.batches.append((x, x2, r))
-        self.updates += 1
-        return 0.0
-
-    def kept(self):
-        return (torch.cat(part) for part in zip(*self.batches))
 
 
 # ---------------------------------------------------------------- DADS
 
 @pytest.fixture
-def dads(s3):
-    """A run whose steps are drawn from 300 stored ones; q has means and variances unlike those at the start."""
+def dads(s3, monkeypatch):
+    """dads(passes) -> passes of train_dads that draw from 300 stored steps: skills drive, and noise."""
     torch.manual_seed(0)
-    vars(s3).update(METHOD="dads", PRIOR_SAMPLES=30, RELABELLED=0.0, UPDATES_PER_STEP=1, UPDATES=1, BATCH=64,
-                    MODEL_BATCH=50)
-    q = common.Decoder(2, 2, 16)
-    with torch.no_grad():
-        q.head[2].weight *= 10
-        q.head[2].bias[2] = -6  # below the least deviation
-    stored = [torch.randn(300, n) for n in (27, 8, 27)] + [0.05 * torch.randn(300, 2), torch.rand(300, 2) * 2 - 1]
+    vars(s3).update(METHOD="dads", ROBOTS=3, SKILL_STEPS=5, EPISODE=10, REPLAY=300, WARM_UP=10, HIDDEN=8, THREADS=1,
+                    UPDATES=10 ** 9, UPDATES_PER_STEP=1, BATCH=64, MODEL_BATCH=50, MODEL_UPDATES=2, PRIOR_SAMPLES=30,
+                    RELABELLED=0.0, RECENT=120, LEARNING_RATE=0.0)
 
-    def sample(n, recent=None):
-        pick = torch.randint(300, (n,))
-        return [part[pick] for part in stored]
-    run = SimpleNamespace(decoder=q, sac=Sac(), sample=sample, z=None, renew=lambda z: None, warm=lambda: True,
-                          act=lambda z: None, collect=lambda: None, learn=lambda *steps: s3.Run.learn(run, *steps),
-                          adam=torch.optim.SGD(q.parameters(), lr=0.0), losses={}, stored=stored)
+    def fill(replay):
+        replay.added = 300
+        stored = replay.read(slice(0, 300))
+        stored.s.copy_(torch.randn(300, 27))
+        stored.s2.copy_(torch.randn(300, 27))
+        stored.z.copy_(torch.rand(300, 2) * 2 - 1)
+        stored.displacement.copy_(stored.z @ torch.tensor([[0.0, 0.04], [-0.04, 0.0]]) + 0.01 * torch.randn(300, 2))
+        stored.displacement[180:] *= 2  # the latest 120
+
+    def run(passes=1, prepare=lambda log: None):
+        done = one_pass(s3, monkeypatch, lambda: s3.train_dads(None, []), fill, prepare, passes)
+        done.q = done.log.policy.decoder
+        return done
     return run
 
 
-def information(q, displacement, z, others):
-    """log(L + 1) - log(1 + sum_i exp(log q(x | z_i) - log q(x | z))), one displacement at a time."""
-    x, found = displacement / 0.1, []
-    for i in range(len(x)):
-        own = gaussian(q, z[i:i + 1]).log_prob(x[i:i + 1])
-        away = (gaussian(q, others).log_prob(x[i].expand(len(others), 2)) - own).clamp(-50, 50).double()
-        found.append(math.log(len(others) + 1) - math.log1p(away.exp().sum().item()))
+def information(q, d, z, others):
+    """log(L + 1) - log(1 + sum_i exp(log q(d | z_i) - log q(d | z))), one displacement (in units) at a time. q(. | z):
+    a Gaussian of deviation 1."""
+    def log_q(d, z):
+        return D.Independent(D.Normal(q(z, 1)[0][:, 0].detach(), 1.0), 1).log_prob(d)
+    found = []
+    for i in range(len(d)):
+        away = log_q(d[i].expand(len(others), 2), others) - log_q(d[i:i + 1], z[i:i + 1])
+        found.append(math.log(len(others) + 1) - math.log1p(away.clamp(-50, 50).double().exp().sum().item()))
     return torch.tensor(found)
 
 
 def test_one_pass_of_dads_learns_q_and_pays_the_information(s3, dads):
-    torch.manual_seed(1)
-    s3.train_dads(dads)
-    q = dads.decoder
-    x, x2, r = dads.sac.kept()
-    rows = (x[:, None, :27] == dads.stored[0]).all(2).nonzero()[:, 1]  # which of the stored steps these are
-    assert torch.equal(x[:, 27:], dads.stored[4][rows])
-    assert torch.equal(x2, torch.cat([dads.stored[2][rows], x[:, 27:]], 1))
-    torch.manual_seed(1)  # the same draws again: skills of the robots, q's batch, the batch, relabelling, the prior
-    torch.rand(s3.ROBOTS, 2)
-    pick = torch.randint(300, (50,))
-    torch.randint(300, (64,))
+    done = dads(prepare=lambda log: log.policy.decoder.head[2].weight.data.mul_(30))
+    rows = (done.batch.s[:, None, 0] == done.stored.s[:, 0]).int().argmax(1)  # which of the stored steps these are
+    for name in ("s", "a", "s2", "displacement", "z"):
+        assert torch.equal(vars(done.batch)[name], vars(done.stored)[name][rows])
+    assert torch.equal(done.c, done.batch.z) and torch.equal(done.c2, done.c)
+    unit = done.stored.displacement[180:].square().mean().sqrt()  # of the steps in RECENT
+    assert done.log.policy.scale == pytest.approx(unit.item())
+    torch.set_rng_state(done.random)  # the same draws again: two batches of q, the batch, relabelling, the prior
+    torch.randint(120, (50,))
+    pick = 299 - torch.randint(120, (50,))  # the latest steps
+    assert torch.equal(rows, 299 - torch.randint(300, (64,)))
     torch.rand(64, 1), torch.rand(64, 2)
     others = torch.rand(30, 2) * 2 - 1
-    expected = s3.REWARD_SCALE * information(q, dads.stored[3][rows], x[:, 27:], others).float()
-    torch.testing.assert_close(r, expected, atol=1e-3, rtol=1e-3)
-    assert r.std() > 0.01
-    displacement, z = dads.stored[3][pick], dads.stored[4][pick]
-    expected = -gaussian(q, z).log_prob(displacement / 0.1).mean() - math.log(2 * math.pi)  # ours leaves it out
-    assert dads.losses["model_loss"] == pytest.approx(expected.item(), abs=1e-4)
+    expected = s3.REWARD_SCALE * information(done.q, done.batch.displacement / unit, done.c, others).float()
+    torch.testing.assert_close(done.r, expected, atol=1e-3, rtol=1e-3)
+    assert done.r.std() > 0.005 and done.log.numbers["reward"] == pytest.approx(expected.mean().item(), abs=1e-4)
+    p = D.Independent(D.Normal(done.q(done.stored.z[pick], 1)[0][:, 0], 1.0), 1)
+    expected = -p.log_prob(done.stored.displacement[pick] / unit).mean() - math.log(2 * math.pi)  # ours leaves it out
+    assert done.log.numbers["model_loss"] == pytest.approx(expected.item(), abs=1e-4)
 
 
 def test_skill_dynamics_learn_what_skills_do(s3, dads):
     """Robots whose step is a turned skill and noise: the prediction nears it and the information rises."""
-    turn = torch.tensor([[0.0, 0.04], [-0.04, 0.0]])
-    vars(s3).update(UPDATES=150, MODEL_BATCH=256, BATCH=2)
-    dads.stored[3][:] = dads.stored[4] @ turn + 0.003 * torch.randn(300, 2)
-    q = dads.decoder = common.Decoder(2, 2, 64)
-    dads.adam = torch.optim.Adam(q.parameters(), lr=3e-3)
-    s3.train_dads(dads)
-    z = torch.rand(500, 2) * 2 - 1
-    assert (0.1 * q(z, 1)[0][:, 0] - z @ turn).square().mean().sqrt() < 0.4 * (z @ turn).square().mean().sqrt()
-    found = information(q, dads.stored[3], dads.stored[4], torch.rand(30, 2) * 2 - 1)
-    assert found.mean() > 0.3
+    vars(s3).update(MODEL_BATCH=256, BATCH=2, LEARNING_RATE=3e-3, MODEL_UPDATES=4, RECENT=300, WARM_UP=1)
+    before = dads(passes=1)
+    done = dads(passes=60)
+    z, turn = torch.rand(500, 2) * 2 - 1, torch.tensor([[0.0, 0.04], [-0.04, 0.0]])
+    for now, bound in ((before, (0.7, 9)), (done, (0, 0.4))):
+        wanted = 1.4 * z @ turn  # between once and twice as far
+        error = (now.log.policy.scale * now.q(z, 1)[0][:, 0] - wanted).square().mean().sqrt() / wanted.square().mean().sqrt()
+        assert bound[0] < error < bound[1]
+    d = done.stored.displacement / done.log.policy.scale
+    found, first = (information(q, d, done.stored.z, torch.rand(30, 2) * 2 - 1).mean() for q in (done.q, before.q))
+    assert found > 0.2 > 3 * first
+
+
+def test_relabelled_steps_of_dads_have_fresh_skills(s3, dads):
+    s3.RELABELLED = 0.5
+    done = dads()
+    stored = (done.c[:, None] == done.stored.z).all(2).any(1)
+    assert 0.3 < stored.float().mean() < 0.7 and done.c.abs().max() <= 1
 
 
 # ---------------------------------------------------------------- SeCTAR
 
 @pytest.fixture
-def sectar(s3):
-    """A run with a full replay buffer: 4 trajectories of 6 robots, 5 steps each. A state holds who made it and when."""
+def sectar(s3, monkeypatch):
+    """sectar(prepare, steps) -> one pass of train_sectar over a full replay buffer: 4 trajectories of 6 robots, 5 steps
+    each, of which 3 steps of a fifth have overwritten a part. A state holds who made it and when."""
     torch.manual_seed(0)
-    vars(s3).update(METHOD="sectar", ROBOTS=6, SKILL_STEPS=5, Z_DIM=4, RECENT=60, MODEL_BATCH=40, RELABELLED=0.0,
-                    UPDATES_PER_STEP=4, UPDATES=1, BATCH=200, REWARD_SCALE=0.3)
-    run = SimpleNamespace(widths=(3, 1, 3, 2, 4), steps=4 * 5 + 3, sac=Sac(), losses={}, warm=lambda: True,
-                          z=torch.zeros(6, 4), renew=lambda z: None, act=lambda c: None, collect=lambda: None,
-                          learn=lambda *steps: s3.Run.learn(run, *steps))
-    run.model = dict(encoder=common.layers(2 * 5, 8, 2 * 4), decoder=common.Decoder(4, 2, 8))
-    run.decoder = run.model["decoder"]
-    run.replay = torch.zeros(4 * 5 * 6, 13)
+    vars(s3).update(METHOD="sectar", ROBOTS=6, SKILL_STEPS=5, EPISODE=10, REPLAY=120, WARM_UP=10, HIDDEN=8, THREADS=1,
+                    UPDATES=10 ** 9, UPDATES_PER_STEP=4, BATCH=200, MODEL_BATCH=40, Z_DIM=4, RECENT=60, RELABELLED=0.0,
+                    REWARD_SCALE=0.3, LEARNING_RATE=0.0)
     skills = torch.randn(5, 6, 4)
     skills[:, :2, :2] = 3 * torch.nn.functional.normalize(skills[:, :2, :2], dim=2)
     skills[:, :2, 3] = s3.EXPLORER  # two of six robots explore
-    for step in range(run.steps):
-        for robot in range(6):
-            s = torch.tensor([step, robot, 0.0])
-            run.replay[(6 * step + robot) % 120] = torch.cat(
-                [s, torch.zeros(1), s + torch.tensor([1.0, 0, 0]), 0.05 * torch.randn(2), skills[step // 5, robot]])
-    run.adam = torch.optim.SGD([p for net in run.model.values() for p in net.parameters()], lr=0.0)
+
+    def run(prepare=lambda log: None, steps=4 * 5 + 3):
+        def fill(replay):
+            replay.added = 6 * steps
+            for step in range(steps):
+                for robot in range(6):
+                    row = replay.read(slice((6 * step + robot) % 120, (6 * step + robot) % 120 + 1))  # a view
+                    row.s[0, :2] = torch.tensor([step, robot])
+                    row.s2[0, :2] = torch.tensor([step + 1, robot])
+                    row.displacement[0] = 0.05 * torch.randn(2)
+                    row.z[0] = skills[step // 5, robot]
+        done = one_pass(s3, monkeypatch, lambda: s3.train_sectar(None, []), fill, prepare)
+        vae = done.log.parts[0]
+        done.encoder, done.decoder = vae["encoder"].requires_grad_(False), vae["decoder"].requires_grad_(False)
+        return done
     return run
 
 
 def test_one_pass_of_sectar_pays_the_place_where_a_trajectory_ends(s3, sectar):
-    sectar.model["encoder"][-1].weight.data[4:] = 0  # q(z | tau) without noise
-    sectar.model["encoder"][-1].bias.data[4:] = -40
-    s3.train_sectar(sectar)
-    stored = {(int(row[0]), int(row[1])): row for row in sectar.replay}
-    x, x2, r = sectar.sac.kept()
-    explored = 0
-    for one, after, found in zip(x, x2, r):
-        step, robot = int(one[0]), int(one[1])
-        t, z = step % 5, stored[step, robot][9:]
+    def without_noise(log):
+        last = log.parts[0]["encoder"][-1]
+        last.weight.data[4:] = 0
+        last.bias.data[4:] = -40  # q(z | tau) is its mean
+    done = sectar(without_noise)
+    stored = {tuple(s[:2].int().tolist()): (d, z) for s, d, z in zip(done.stored.s, done.stored.displacement, done.stored.z)}
+    assert len(stored) == 120
+    explored, whole = 0, set()
+    for s, c, c2, found in zip(done.batch.s, done.c, done.c2, done.r):
+        step, robot = s[:2].int().tolist()
+        t, (_, z) = step % 5, stored[step, robot]
         first = step - t
-        assert first + 4 < sectar.steps  # a trajectory that is whole
-        path = torch.stack([stored[first + i, robot][7:9] for i in range(5)]) / 0.1
+        assert 0 < first < 20  # a trajectory that is whole
+        whole.add((step, robot))
+        path = torch.stack([stored[first + i, robot][0] for i in range(5)]) / 0.1
         if robot < 2:  # the explorer: its command is its own, its decoded path is the encoder's
             explored += 1
-            torch.testing.assert_close(one[3:], z[:2])
-            mean = sectar.model["encoder"](path.flatten())[:4].detach()
-            miss = path - sectar.decoder(mean[None], 5)[0][0].detach()
+            assert torch.equal(c, z[:2]) and torch.equal(c2, z[:2])
+            miss = path - done.decoder(done.encoder(path.flatten()[None])[:, :4], 5)[0][0]
             assert found.item() == pytest.approx(0.3 * float(miss[t] @ z[:2]) / 3, abs=1e-5)
             continue
-        decoded = sectar.decoder(z[None], 5)[0][0].detach()
+        decoded = done.decoder(z[None], 5)[0][0]
         miss = path - decoded
         end = miss.sum(0) / miss.sum(0).norm()
         assert found.item() == pytest.approx(-0.3 * float(miss[t] @ end), abs=1e-5)
-        torch.testing.assert_close(one[3:], decoded[t])  # the command of now, and of the next step
-        torch.testing.assert_close(after[3:], decoded[min(4, t + 1)])
-    assert 0.1 < explored / len(x) < 0.6
+        torch.testing.assert_close(c, decoded[t])  # the command of now, and of the next step
+        torch.testing.assert_close(c2, decoded[min(4, t + 1)])
+    assert 0.1 < explored / len(done.r) < 0.6 and len(whole) > 80
 
 
-def test_sectar_waits_for_the_first_whole_trajectories(s3, sectar):
-    sectar.steps, sectar.collect = 4, lambda: vars(sectar.sac).update(updates=1)
-    s3.train_sectar(sectar)
-    assert not sectar.sac.batches
+def test_sectar_waits_for_the_first_whole_trajectories(sectar):
+    assert sectar(steps=4).batch is None and sectar(steps=5).batch is not None
+
+
+def test_explorers_of_sectar_are_a_share_and_keep_their_mark(s3, sectar):
+    """New skills of 600 robots: of a tenth, the last entry is the mark, and the first two a long command."""
+    vars(s3).update(ROBOTS=600, EXPLORE=0.1, REPLAY=6000, WARM_UP=10 ** 6)
+    done = sectar(steps=0)
+    z = done.log.replay.latest(600).z
+    marked = z[:, 3] == s3.EXPLORER
+    assert marked.float().mean().item() == pytest.approx(0.1, abs=0.04)
+    assert torch.allclose(z[marked, :2].norm(dim=1), torch.tensor(s3.EXPLORER))
+    assert z[~marked].std(0).tolist() == pytest.approx([1] * 4, abs=0.12)
 
 
 def test_elbo_of_sectar_equals_torch_distributions(s3, sectar):
     """Without an explorer all trajectories teach the model; of its loss, every draw is repeated here."""
     s3.EXPLORE = 0.0
-    with torch.no_grad():
-        sectar.model["encoder"][4].bias += 0.5  # a divergence that counts
-    torch.manual_seed(3)
-    s3.train_sectar(sectar)
-    torch.manual_seed(3)
-    torch.randn(6, 4), torch.rand(6)
+
+    def prepare(log):
+        log.parts[0]["encoder"][4].bias.data += 0.5  # a divergence that counts
+        log.parts[0]["decoder"].head[2].bias.data[3] = -8  # below the least deviation
+    done = sectar(prepare)
+    torch.set_rng_state(done.random)
     back, robot = torch.randint(2, (40,)), torch.randint(6, (40,))  # RECENT: 60 steps are the two latest trajectories
     rows = (3 - back) % 4 * 30 + robot
-    x = torch.stack([sectar.replay[rows + 6 * i, 7:9] for i in range(5)], 1) / 0.1
-    mean, log_var = sectar.model["encoder"](x.reshape(40, 10)).detach().chunk(2, 1)
+    x = torch.stack([done.stored.displacement[rows + 6 * i] for i in range(5)], 1) / 0.1
+    mean, log_var = done.encoder(x.reshape(40, 10)).chunk(2, 1)
     q = D.Independent(D.Normal(mean, (0.5 * log_var).exp()), 1)
     z = mean + (0.5 * log_var).exp() * torch.randn(40, 4)
-    decoded, log_var = (v.detach() for v in sectar.decoder(z, 5))
-    p = D.Normal(decoded, (0.5 * log_var).exp().clamp(min=s3.FLOOR_END / 0.1))
+    decoded, log_var = done.decoder(z, 5)
+    p = D.Normal(decoded, (0.5 * log_var).exp().clamp(min=0.1))  # at least 1 cm
     kl = D.kl_divergence(q, D.Independent(D.Normal(torch.zeros(40, 4), 1.0), 1))
     constant = 10 * 0.5 * math.log(2 * math.pi)  # ours leaves it out
     expected = s3.KL_WEIGHT * kl - p.log_prob(x).sum((1, 2)) - constant
-    assert sectar.losses["model_loss"] == pytest.approx(expected.mean().item(), abs=1e-3)
+    assert done.log.numbers["model_loss"] == pytest.approx(expected.mean().item(), abs=1e-3)

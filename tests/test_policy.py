@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from conftest import S3, load_policy, one_line, robot_spec, script, tiny
+from conftest import S3, load_policy, one_line, one_pass, robot_spec, script, tiny
 from torch import distributions as D
 from torch import nn
 
@@ -80,7 +80,7 @@ def test_an_unstable_simulation_is_noticed_and_the_others_go_on(s3):
     robots.reset(np.flatnonzero(unstable))
     assert not robots.step(np.zeros((3, 8)))[1].any()
     robots.qpos[2, 3:7] = 0, 1, 0, 0  # half a turn about x
-    assert s3.upside_down(robots).tolist() == [False, False, True]
+    assert s3.upside_down(robots.qpos).tolist() == [False, False, True]
 
 
 # ---------------------------------------------------------------- actor and base frame
@@ -139,6 +139,32 @@ def test_reward_is_equation_6_up_to_its_maximum(s3):
         torch.testing.assert_close(s3.reward(mean, log_var, displacement, floor), expected, **CLOSE)
 
 
+def test_the_floor_shrinks_geometrically_and_may_be_off(s3):
+    vars(s3).update(FLOOR_START=0.08, FLOOR_END=0.02, FLOOR_FROM=0.2, FLOOR_UNTIL=0.6)
+    for progress, floor in ((0, 0.08), (0.2, 0.08), (0.4, 0.04), (0.6, 0.02), (1, 0.02)):
+        assert s3.floor_at(progress) == pytest.approx(floor)
+    for start, end, floors in ((0.0, 0.0, (0, 0, 0)), (0.04, 0.0, (0.04, 0, 0)), (0.0, 0.01, (0, 0, 0))):
+        vars(s3).update(FLOOR_START=start, FLOOR_END=end)
+        assert [s3.floor_at(progress) for progress in (0.1, 0.4, 0.9)] == pytest.approx(floors)
+    vars(s3).update(FLOOR_START=0.04, FLOOR_END=0.01, FLOOR_FROM=0.5, FLOOR_UNTIL=0.5)  # at once
+    assert [s3.floor_at(progress) for progress in (0.5, 0.51)] == pytest.approx([0.04, 0.01])
+
+
+@pytest.mark.parametrize("x_dim", [2, 1])
+def test_a_share_of_random_corrections_is_uniform_in_a_disc(s3, x_dim):
+    torch.manual_seed(0)
+    s3.CORRECTED = 0.3
+    found = s3.random_corrections(40_000, x_dim)
+    size = found.norm(dim=1)
+    made = size > 0
+    assert made.float().mean().item() == pytest.approx(0.3, abs=0.01) and size.max() <= common.CORRECTION + 1e-6
+    assert (size[made] < common.CORRECTION / 2).float().mean().item() == pytest.approx(0.25, abs=0.02)  # of the area
+    assert found.mean(0).abs().max() < 0.01 and found.shape == (40_000, x_dim)
+    for changed in (dict(CORRECTED=0.0), dict(CORRECTED=1.0)):
+        vars(s3).update(changed)
+        assert (s3.random_corrections(50, x_dim).norm(dim=1) > 0).float().mean() == s3.CORRECTED
+
+
 def small_sac(s3, every):
     torch.manual_seed(0)
     vars(s3).update(HIDDEN=32, TEMPERATURE=0.05, BASE_FRAME=False, ACTOR_EVERY=every, DISCOUNT=0.9)
@@ -151,18 +177,11 @@ def small_sac(s3, every):
 
 
 def test_one_update_of_sac_equals_a_plain_version(s3):
-    """Adam is replaced by a plain step down the gradient; the plain version has two separate critics."""
+    """Adam is replaced by a plain step down the gradient, and the two losses of one backward by one at a time."""
     sac, (x, a, x2, r) = small_sac(s3, 1)
     sac.critic_adam = torch.optim.SGD(sac.critics.parameters(), lr=1.0)
     sac.actor_adam = torch.optim.SGD([*sac.actor.parameters(), *sac.value.parameters()], lr=1.0)
-    plain = [nn.Sequential(nn.Linear(10, 32), nn.ReLU(), nn.Linear(32, 32), nn.ReLU(), nn.Linear(32, 1))
-             for _ in range(2)]
-    for k, net in enumerate(plain):
-        for i, layer in enumerate((net[0], net[2], net[4])):
-            layer.weight.data = sac.critics.weights[i][k].T.detach().clone()
-            layer.bias.data = sac.critics.biases[i][k, 0].detach().clone()
-    actor, value = s3.copy.deepcopy(sac.actor), s3.copy.deepcopy(sac.value)
-    target, average = s3.copy.deepcopy(sac.target), s3.copy.deepcopy(sac.average)
+    plain, actor, value, target, average = map(s3.copy.deepcopy, (sac.critics, sac.actor, sac.value, sac.target, sac.average))
     torch.manual_seed(1)
     sac.update(x, a, x2, r)
 
@@ -174,21 +193,28 @@ def test_one_update_of_sac_equals_a_plain_version(s3):
         for p, slope in zip(parameters, torch.autograd.grad(loss, parameters)):
             p.data -= slope
 
-    torch.testing.assert_close(s3.Critics(10)(x, a).shape, torch.Size([2, 64]))
     goal = (r + 0.9 * target(x2).squeeze(1)).detach()
+    assert sac.losses["q"] == pytest.approx(q(plain[0], a).mean().item(), abs=1e-6)
     descend(sum(0.5 * (q(net, a) - goal).square().mean() for net in plain), *plain)
-    torch.testing.assert_close(sac.critics(x, a), torch.stack([q(net, a) for net in plain]), **CLOSE)
     torch.manual_seed(1)
     a_new, log_prob = actor(x)
     smaller = torch.min(q(plain[0], a_new), q(plain[1], a_new))
     v_goal = (smaller - 0.05 * log_prob).detach()
     descend((0.05 * log_prob - smaller).mean(), actor)
     descend(0.5 * (value(x).squeeze(1) - v_goal).square().mean(), value)
-    for ours, theirs, old, rate in ((sac.actor, actor, average, s3.AVERAGED), (sac.value, value, target, s3.SMOOTHING)):
-        followed = sac.average if ours is sac.actor else sac.target
-        for p, wanted, before, after in zip(*(net.parameters() for net in (ours, theirs, old, followed))):
+    for ours, theirs in ((sac.critics, plain), (sac.actor, actor), (sac.value, value)):
+        for p, wanted in zip(ours.parameters(), theirs.parameters()):
             torch.testing.assert_close(p, wanted, **CLOSE)
-            torch.testing.assert_close(after, (1 - rate) * before + rate * wanted, **CLOSE)
+    for followed, before, ours, rate in ((sac.average, average, actor, s3.AVERAGED), (sac.target, target, value, s3.SMOOTHING)):
+        for after, old, wanted in zip(*(net.parameters() for net in (followed, before, ours))):
+            torch.testing.assert_close(after, (1 - rate) * old + rate * wanted, **CLOSE)
+
+
+def test_without_an_average_the_policy_is_the_actor(s3):
+    sac, batch = small_sac(s3, 1)
+    s3.AVERAGED = 0.0  # off
+    sac.update(*batch)
+    assert all(torch.equal(p, q) for p, q in zip(sac.average.parameters(), sac.actor.parameters()))
 
 
 def test_the_actor_waits_for_every_second_update_of_the_critics(s3):
@@ -203,73 +229,149 @@ def test_the_actor_waits_for_every_second_update_of_the_critics(s3):
     assert all(changed(waiting)) and not any(changed(waiting))
 
 
-def test_the_learning_rate_falls_in_the_second_half(s3):
-    sac, (_, a, _, r) = small_sac(s3, 1)
-    s3.UPDATES, run = 1000, SimpleNamespace(sac=sac)
+def test_learn_takes_batches_and_its_rate_falls_in_the_second_half(s3, monkeypatch):
+    sac, _ = small_sac(s3, 1)
+    vars(s3).update(UPDATES=1000, BATCH=24)
+    taken, batch = [], SimpleNamespace(s=torch.randn(72, 5), a=torch.randn(72, 3), s2=torch.randn(72, 5))
+    c, c2, r = torch.randn(72, 2), torch.randn(72, 2), torch.randn(72)
+    monkeypatch.setattr(sac, "update", lambda *part: taken.append(part))
     for progress, rate in ((0, 1), (0.25, 1), (0.5, 1), (0.75, 0.5), (1, 0)):
         sac.updates = int(1000 * progress)
-        s3.Run.learn(run, torch.zeros(64, 5), a, torch.zeros(64, 5), torch.zeros(64, 2), torch.zeros(64, 2), r)
+        sac.learn(batch, c, c2, r)
         for optimizer in (sac.critic_adam, sac.actor_adam):
             assert optimizer.param_groups[0]["lr"] == pytest.approx(rate * s3.LEARNING_RATE)
+    assert [len(part[0]) for part in taken] == [24] * 15
+    wanted = sac.actor.inputs(batch.s, c), batch.a, sac.actor.inputs(batch.s2, c2), r
+    assert all(map(torch.equal, map(torch.cat, zip(*taken[:3])), wanted))
 
 
-# ---------------------------------------------------------------- replay buffer and checkpoints
+# ---------------------------------------------------------------- the loop of Alg. 1
 
-@pytest.fixture
-def run(s3):
-    """A Run of 8 robots with a replay buffer of 16 steps each; its stored z counts the steps from 1."""
+THREE = ["speed", "direction", "curvature"]
+
+
+def test_one_pass_of_alg_1_pays_equation_6(s3, monkeypatch):
+    """Stored steps, a share of them relabelled, judged by torch.distributions; the commands before and after."""
     torch.manual_seed(0)
-    vars(s3).update(ROBOTS=8, SKILL_STEPS=4, EPISODE=12, REPLAY=128, WARM_UP=16, HIDDEN=16, THREADS=1, UPDATES=10 ** 9)
-    run = s3.Run(None, [], 2, 2, {})
+    vars(s3).update(ROBOTS=4, SKILL_STEPS=5, EPISODE=10, REPLAY=400, WARM_UP=10, UPDATES=8, HIDDEN=16, BATCH=600,
+                    UPDATES_PER_STEP=2, RELABELLED=0.4, CORRECTED=0.5, FLOOR_START=0.05, THREADS=1)
+    decoder = common.Decoder(3, 2, 16).requires_grad_(False)
+    decoder.head[2].weight *= 5
 
-    def steps(n):
-        for _ in range(n):
-            run.z = torch.full((8, 2), run.steps + 1.0)
-            run.act(torch.zeros(8, 2))
-            run.collect()
-    run.go = steps
-    return run
+    def fill(replay):
+        replay.added = 300
+        replay.table[:300] = torch.randn(300, replay.table.shape[1])
+        replay.read(slice(0, 300)).displacement.mul_(0.05)
+        replay.read(slice(0, 300)).correction.mul_(0.1)
+    done = one_pass(s3, monkeypatch, lambda: s3.train_wedis(decoder, THREE), fill)
+    stored, batch, n = done.stored, done.batch, 1200
+    rows = (batch.s[:, None, 0] == stored.s[:, 0]).int().argmax(1)  # which of the stored steps these are
+    for name in ("s", "a", "s2", "displacement"):
+        assert torch.equal(vars(batch)[name], vars(stored)[name][rows])
+    own = (batch.z_single == stored.z_single[rows]).all(1)
+    assert own.float().mean().item() == pytest.approx(0.6, abs=0.05)
+    assert torch.equal(batch.correction[own], stored.correction[rows][own])
+    fresh = batch.correction[~own].norm(dim=1)
+    assert fresh.max() <= common.CORRECTION + 1e-6 and (fresh > 0).float().mean().item() == pytest.approx(0.5, abs=0.1)
+    assert batch.z_single[~own].std(0).tolist() == pytest.approx([1, 1], abs=0.15)
+    mean, log_var = (part[:, 0] for part in decoder(torch.cat([batch.z_single, torch.zeros(n, 1)], 1), 1))
+    assert torch.allclose(done.c, mean + batch.correction) and torch.equal(done.c, done.c2)
+    std = (0.5 * (s3.VARIANCE_SCALE * log_var.exp()).log()).exp().clamp(min=0.05)
+    p = D.Independent(D.Normal(0.1 * done.c, std), 1)
+    expected = s3.REWARD_SCALE * (p.log_prob(batch.displacement) - p.log_prob(0.1 * done.c))
+    torch.testing.assert_close(done.r, expected, atol=1e-4, rtol=1e-3)
+    assert done.log.numbers["reward"] == pytest.approx(expected.mean().item(), rel=1e-3)
+    assert done.log.numbers["on_floor"] == pytest.approx((std == 0.05).float().mean().item(), abs=1e-3)
+
+
+@pytest.mark.parametrize("names, x_dim", [(THREE, 2), (["speed", "acceleration"], 1)])
+def test_robots_are_asked_for_single_steps_a_share_of_them_corrected(names, x_dim, s3, monkeypatch):
+    """The commands of 300 robots against the decoder's first means for (z_single, 0), at the first step and later."""
+    torch.manual_seed(0)
+    vars(s3).update(ROBOTS=300, SKILL_STEPS=5, EPISODE=10, WARM_UP=10 ** 6, REPLAY=4500, HIDDEN=8, CORRECTED=0.3, THREADS=1)
+    if x_dim == 1:
+        vars(s3).update(ROBOT="half_cheetah", BASE_FRAME=False)
+    decoder, asked = common.Decoder(len(names), x_dim, 16).requires_grad_(False), []
+    act = common.Actor.act
+    monkeypatch.setattr(common.Actor, "act", lambda actor, s, c: asked.append(c) or act(actor, s, c))
+    done = one_pass(s3, monkeypatch, lambda: s3.train_wedis(decoder, names), passes=12)
+    stored = done.log.replay.read(torch.arange(12 * 300).view(12, 300))
+    assert stored.z_single.shape == (12, 300, x_dim)
+    for t, c in enumerate(asked):
+        mean = decoder(nn.functional.pad(stored.z_single[t], (0, len(names) - x_dim)), 1)[0][:, 0]
+        torch.testing.assert_close(c, mean + stored.correction[t])
+    size = stored.correction[-1].norm(dim=1)
+    assert 0.95 * common.CORRECTION < size.max() <= common.CORRECTION + 1e-6
+    assert (size > 0).float().mean().item() == pytest.approx(0.3, abs=0.07)
+    assert stored.z_single[-1].std(0).tolist() == pytest.approx([1] * x_dim, abs=0.12)  # z_single from the prior
+    renewed = (stored.z_single[1:] != stored.z_single[:-1]).any(2)  # each robot at a time of its own, every fifth step
+    assert renewed[:5].sum(0).eq(1).all() and renewed[5:10].sum(0).eq(1).all()
+    assert 0.1 < renewed[5].float().mean() < 0.3
+
+
+def steps_of(s3, monkeypatch, n, **changed):
+    """Replay buffer and robots of 8 robots after n steps with random actions."""
+    torch.manual_seed(0)
+    vars(s3).update(dict(ROBOTS=8, SKILL_STEPS=4, EPISODE=12, REPLAY=128, WARM_UP=10 ** 6, HIDDEN=8, THREADS=1) | changed)
+    done = one_pass(s3, monkeypatch, lambda: s3.train_wedis(common.Decoder(3, 2, 8).requires_grad_(False), THREE), passes=n)
+    return done.log.replay, done.log.robots
+
+
+@pytest.mark.parametrize("n, added", [(3, 24), (37, 296)])
+def test_stored_steps_go_on_where_the_last_one_ended(s3, monkeypatch, n, added):
+    replay, robots = steps_of(s3, monkeypatch, n)
+    assert replay.added == added and len(replay.table) == 128
+    kept = min(n, 16)
+    rows = replay.read((torch.arange(kept * 8) + (n - kept) * 8) % 128)
+    s, s2 = rows.s.view(kept, 8, 27), rows.s2.view(kept, 8, 27)
+    goes_on = (s[1:] == s2[:-1]).all(2)
+    assert goes_on.float().mean() > 0.85 - (n == 3) and not goes_on.all()  # each robot starts anew every 12 steps
+    torch.testing.assert_close(rows.displacement / 0.05, rows.s2[:, 13:15], atol=2.0, rtol=0)  # metres in 0.05 s
+    assert robots.age().max() < 12 and torch.equal(robots.observe()[robots.age()[:, 0] > 0],
+                                                   replay.latest(8).s2[robots.age()[:, 0] > 0])
+
+
+def test_an_unstable_step_is_not_stored_and_the_robot_starts_anew(s3, monkeypatch):
+    step, count = common.Robots.step, iter(range(99))
+
+    def fail(robots, action):
+        displacement, unstable = step(robots, action)
+        if next(count) == 3:
+            displacement[5], unstable[5] = math.nan, True
+        return displacement, unstable
+    monkeypatch.setattr(common.Robots, "step", fail)
+    replay, robots = steps_of(s3, monkeypatch, 4, EPISODE=1000)
+    last, before = replay.table[24:32], replay.table[16:24]
+    assert torch.equal(last[5], before[5]) and not torch.equal(last[4], before[4])
+    assert robots.time[5] == 0 and (np.delete(robots.time, 5) > 0).all()
+    assert torch.isfinite(replay.table).all()
 
 
 @pytest.mark.parametrize("n", [3, 16, 37])
-def test_sample_gives_stored_steps_of_the_recent_window(run, n):
-    run.go(n)
-    for recent, oldest in ((None, max(1, n - 15)), (16, max(1, n - 1))):
-        s, a, s2, displacement, z = run.sample(2000, recent)
-        assert set(z[:, 0].int().tolist()) == set(range(oldest, n + 1))
-        assert (s.shape, a.shape, s2.shape, displacement.shape) == ((2000, 27), (2000, 8), (2000, 27), (2000, 2))
-        torch.testing.assert_close(displacement / 0.05, s2[:, 13:15], atol=2.0, rtol=0)  # metres in 0.05 s
-    rows = run.replay.view(-1, 8, 66)
-    s, s2, when = rows[..., :27], rows[..., 35:62], rows[..., -1]
-    goes_on = (when[1:] == when[:-1] + 1) & (s[1:] == s2[:-1]).all(2)  # it begins where the last one ended
-    assert goes_on.float().mean() > (0.5 if n > 15 else 0)
+def test_the_replay_buffer_gives_the_latest_steps(s3, n):
+    vars(s3).update(ROBOTS=8, SKILL_STEPS=4, REPLAY=128)
+    replay = s3.Replay(s=2, when=1)
+    assert not replay.latest(8).when.any()  # at the start zeros
+    for t in range(1, n + 1):
+        replay.add(torch.zeros(8, dtype=torch.bool).numpy(), when=torch.full((8, 1), float(t)), s=torch.rand(8, 2))
+    for recent, oldest in ((None, max(1, n - 15)), (16, max(1, n - 1)), (10 ** 9, max(1, n - 15))):
+        batch = replay.sample(2000, recent)
+        assert set(batch.when[:, 0].int().tolist()) == set(range(oldest, n + 1)) and batch.s.shape == (2000, 2)
+    assert replay.latest(8).when.unique().tolist() == [n]
+    assert replay.latest(24).when[:, 0].tolist() == [n - 2] * 8 + [n - 1] * 8 + [n] * 8
+    assert len(replay.latest(10 ** 9).when) == min(8 * n, 128)
 
 
-def test_the_smallest_replay_buffer_holds_two_skills_of_all_robots(run, s3):
-    s3.REPLAY = 1
-    assert len(s3.Run(None, [], 2, 2, {}).replay) == 2 * 8 * 4
+def test_the_smallest_replay_buffer_holds_two_skills_of_all_robots(s3):
+    vars(s3).update(ROBOTS=8, SKILL_STEPS=4, REPLAY=1)
+    assert len(s3.Replay(s=2).table) == 2 * 8 * 4
 
 
-def test_an_unstable_step_is_not_stored_and_the_robot_starts_anew(run):
-    run.go(3)
-    step = run.robots.step
-
-    def fail(action):
-        displacement, unstable = step(action)
-        displacement[5], unstable[5] = math.nan, True
-        return displacement, unstable
-    run.robots.step = fail
-    run.go(1)
-    last, before = run.replay[24:32], run.replay[16:24]
-    assert torch.equal(last[5], before[5]) and not torch.equal(last[4], before[4])
-    assert run.robots.time[5] == 0 and (np.delete(run.robots.time, 5) > 0).any()
-    assert torch.isfinite(run.replay).all()
-
+# ---------------------------------------------------------------- checkpoints
 
 def outcome(out, experiment):
     """Policy and checkpoint without clocks and flags."""
     found = [common.load(out, kind, experiment, 0) for kind in ("policy", "policy-checkpoint")]
-    found[1]["numbers"] = found[1]["numbers"][:2]  # the last is the clock
     return [{key: value for key, value in content.items() if key not in ("seconds", "config", "sha256")}
             for content in found]
 
@@ -288,41 +390,22 @@ def same(one, other):
 def test_resumed_and_two_threads_give_the_same_bits(experiment, out, inside, monkeypatch, s3):
     monkeypatch.setattr(s3, "measure", lambda *_: None)
     monkeypatch.setattr(s3, "draw_skills", lambda *_: None)
-    flags = ["--experiment", experiment, "--updates", 48]
-    collect, ends = s3.Run.collect, []
+    tiny_run = dict(experiment=experiment, updates=48)
+    step, ends = s3.Log.step, []
 
-    def cut(run):
-        collect(run)
-        if run.sac.updates == 24:  # the first report, and with it a checkpoint
+    def cut(log):
+        step(log)
+        if log.sac.updates == 24:  # the first report, and with it a checkpoint
             raise SystemExit("cut")
     for threads in (1, 2):
-        assert inside(s3, *tiny(out, threads=threads), *flags).returncode == 0
+        assert inside(s3, *tiny(out, **tiny_run, threads=threads)).returncode == 0
         ends.append(outcome(out, experiment))
     (out / f"policy_{experiment}_seed0.pt").unlink()
-    monkeypatch.setattr(s3.Run, "collect", cut)
-    assert inside(s3, *tiny(out), *flags).returncode == "cut"
-    monkeypatch.setattr(s3.Run, "collect", collect)
-    assert inside(s3, *tiny(out), *flags, "--resume", "true").returncode == 0
+    monkeypatch.setattr(s3.Log, "step", cut)
+    assert inside(s3, *tiny(out, **tiny_run)).returncode == "cut"
+    monkeypatch.setattr(s3.Log, "step", step)
+    assert inside(s3, *tiny(out, **tiny_run), "--resume", "true").returncode == 0
     assert same(ends[0], ends[1]) and same(ends[0], outcome(out, experiment))
-
-
-# ---------------------------------------------------------------- commands of the training
-
-@pytest.mark.parametrize("x_dim", [2, 1])
-def test_a_share_of_the_commands_is_corrected_as_the_closed_loop_corrects_them(s3, x_dim):
-    """The commands of 4000 robots against the decoder's first means; on a rail z_single is the speed alone."""
-    torch.manual_seed(0)
-    vars(s3).update(ROBOTS=4000, UPDATES=1, CORRECTED=0.3)
-    decoder, asked = common.Decoder(3, x_dim, 16).requires_grad_(False), []
-    run = SimpleNamespace(z=torch.zeros(4000, 2 * x_dim), decoder=decoder, sac=SimpleNamespace(updates=0), warm=lambda: False,
-                          renew=lambda z: vars(run).update(z=z), act=asked.append,
-                          collect=lambda: vars(run.sac).update(updates=1))
-    s3.train_wedis(run)
-    mean = decoder(nn.functional.pad(run.z[:, :x_dim], (0, 3 - x_dim)), 1)[0][:, 0]
-    size = (asked[0] - mean).norm(dim=1)
-    assert size.max() <= common.CORRECTION + 1e-6 and size.max() > 0.95 * common.CORRECTION
-    assert (size > 1e-6).float().mean().item() == pytest.approx(0.3, abs=0.03)
-    assert run.z[:, :x_dim].std(0).tolist() == pytest.approx([1] * x_dim, abs=0.05)  # z_single from the prior
 
 
 # ---------------------------------------------------------------- relation functions and execution
@@ -346,14 +429,13 @@ class Turning(nn.Module):
         self.weight = weight
 
     def forward(self, z, steps):
-        z = nn.functional.pad(z, (0, 3 - z.shape[1]))
         angle = z[:, 1:2] + self.weight * z[:, 2:3] * torch.arange(steps)
         return (0.5 + 0.2 * z[:, :1, None]) * torch.stack([angle.cos(), angle.sin()], 2), torch.zeros(len(z), steps, 2)
 
 
 @pytest.mark.parametrize("weight", [0.155, -0.31])
 def test_calibration_finds_the_weight_of_a_decoder_that_turns_exactly(s2, weight):
-    found = s2.find_relation(Turning(weight), ["speed", "direction", "curvature"], 5)
+    found = s2.find_relation(Turning(weight), THREE, 5, 1.5)
     assert found == dict(curvature=pytest.approx(weight))
 
 
@@ -377,25 +459,26 @@ class Fake:
     places = 2
 
     def __init__(self, n=1, share=0.9, age=1000.0):
-        self.at, self.share, self.steps, self.asked = torch.zeros(n, 2), share, age, []
+        self.qpos, self.share, self.steps, self.asked = np.zeros((n, 15)), share, age, []
+        self.broken = np.zeros(n, bool)
 
     def place(self):
-        return self.at.clone()
+        return torch.from_numpy(self.qpos[:, :2]).float()
 
-    @property
-    def time(self):
-        return np.full(len(self.at), 0.05 * self.steps)
+    def age(self):
+        return torch.full((len(self.qpos), 1), self.steps)
 
     def observe(self):
-        return torch.zeros(len(self.at), 3)
+        return torch.zeros(len(self.qpos), 3)
 
     def reset(self, ids, rng=None):
-        self.at[ids] = 0
+        self.qpos[ids, :2] = 0
 
     def step(self, action):
         self.asked.append(torch.from_numpy(action))
-        self.at, self.steps = self.at + 0.1 * self.share * self.asked[-1], self.steps + 1
-        return 0.1 * self.share * self.asked[-1], np.zeros(len(self.at), bool)
+        self.qpos[:, :2] += 0.1 * self.share * action
+        self.steps += 1
+        return 0.1 * self.share * self.asked[-1], self.broken
 
 
 OBEY = SimpleNamespace(act=lambda s, c, deterministic: c.clone())  # an actor whose action is its command
@@ -404,7 +487,7 @@ OBEY = SimpleNamespace(act=lambda s, c, deterministic: c.clone())  # an actor wh
 @pytest.fixture
 def numbers(monkeypatch):
     """The numbers of the closed loop that the tests below count with."""
-    for name, value in dict(FEEDBACK=0.1, CORRECTION=0.2, FASTEST=0.85, SOFT_START=40).items():
+    for name, value in dict(FEEDBACK=0.1, CORRECTION=0.2, FASTEST=0.85, SOFT_START=40, SOFT_FROM=0.2).items():
         monkeypatch.setattr(common, name, value)
 
 
@@ -415,8 +498,8 @@ def numbers(monkeypatch):
     ((0.8, 0.0), (0.02, 0.0), 1000, (0.824, 0.0)),
     ((0.3, 0.0), (0.0, 5.0), 1000, (0.3, 0.2)),        # CORRECTION: at most 0.2
     ((3.0, 4.0), (0.0, 0.0), 1000, (0.51, 0.68)),      # FASTEST: 0.85 long
-    ((3.0, 4.0), (0.0, 0.0), 0, (0.12, 0.16)),         # soft start: 0.2 long
-    ((3.0, 4.0), (0.0, 0.0), 20, (0.315, 0.42)),       # half of it: 0.525 long
+    ((3.0, 4.0), (0.0, 0.0), 0, (0.102, 0.136)),       # soft start: SOFT_FROM of it, 0.17 long
+    ((3.0, 4.0), (0.0, 0.0), 20, (0.306, 0.408)),      # half of it: 0.51 long
     ((0.1, 0.0), (0.0, 0.0), 0, (0.1, 0.0))])          # shorter ones pass
 def test_closed_loop_by_hand(c, reference, age, expected, numbers):
     found = common.closed_loop(torch.tensor([c]), torch.tensor([reference]), Fake(age=float(age)), 0.1)
@@ -426,19 +509,76 @@ def test_closed_loop_by_hand(c, reference, age, expected, numbers):
 def test_execute_holds_commands_open_and_closed(numbers):
     commands = torch.tensor([[[0.5, 0.0], [0.0, 2.0]]])
     policy, robots = SimpleNamespace(actor=OBEY, scale=0.1), Fake()
-    assert len(list(common.execute(policy, robots, commands, 3, False, True))) == 6
+    poses = common.execute(policy, robots, commands, 3, False, True)
+    assert poses.shape == (6, 1, 15) and poses[:, 0, :2] == pytest.approx(
+        0.09 * np.cumsum(np.repeat([[0.5, 0], [0, 2]], 3, 0), 0), abs=1e-6)
     torch.testing.assert_close(torch.cat(robots.asked), commands[0].repeat_interleave(3, 0))  # open loop: unchanged
     still = Fake(share=0.0)
-    list(common.execute(policy, still, commands[:, :1], 3, True, True))
+    common.execute(policy, still, commands[:, :1], 3, True, True)
     torch.testing.assert_close(torch.cat(still.asked)[:, 0], torch.tensor([0.5, 0.575, 0.65]))  # 0.5 behind a step
+
+
+OFF = [dict(SOFT_START=0), dict(CORRECTION=0.0), dict(FEEDBACK=0.0), dict(FASTEST=0.1), dict(SOFT_FROM=0.0), dict(SOFT_FROM=1.0),
+       dict(SOFT_START=0, CORRECTION=0.0, FEEDBACK=0.0), dict(FASTEST=0.1, SOFT_FROM=0.0, CORRECTION=0.0)]
+
+
+@pytest.mark.parametrize("changed", OFF, ids=[" ".join(change) for change in OFF])
+@pytest.mark.parametrize("age", [0, 7, 1000])
+def test_what_is_switched_off_is_off_and_commands_keep_their_direction(changed, age, numbers, monkeypatch):
+    """Commands of all sizes, 0 and huge ones among them, against a closed form of one command at a time."""
+    for name, value in changed.items():
+        monkeypatch.setattr(common, name, value)
+    rng = np.random.default_rng(0)
+    c = np.r_[np.zeros((4, 2)), rng.normal(0, 1, (200, 2)) * rng.choice([1e-6, 0.1, 1, 30], (200, 1))]
+    behind = rng.normal(0, 1, (204, 2)) * rng.choice([0, 1e-4, 0.1, 50], (204, 1))  # metres
+    behind[:2] = 0
+    found = common.closed_loop(torch.tensor(c).float(), torch.tensor(behind).float(), Fake(204, age=float(age)), 0.1).numpy()
+    grown = min(1, age / common.SOFT_START) if common.SOFT_START else 1
+    longest = common.FASTEST * (common.SOFT_FROM + (1 - common.SOFT_FROM) * grown)
+    for one, gap, ours in zip(c, behind, found):
+        gain = common.FEEDBACK * (2 - min(1, np.hypot(*one))) * gap / 0.1
+        if common.CORRECTION and np.hypot(*gain) > common.CORRECTION:
+            gain *= common.CORRECTION / np.hypot(*gain)
+        if not common.CORRECTION:  # off
+            gain *= 0
+        wanted = one + gain
+        if np.hypot(*wanted) > longest:
+            wanted *= longest / np.hypot(*wanted)
+        assert np.isfinite(ours).all() and ours == pytest.approx(wanted, abs=1e-5)
+        assert np.hypot(*ours) <= longest + 1e-5 and ours @ (one + gain) >= -1e-6  # never reversed
+
+
+def test_the_soft_start_takes_as_many_environment_steps_whatever_a_step_is(numbers, monkeypatch):
+    monkeypatch.setattr(common, "FRAME_SKIP", 11)
+    robots = common.Robots(robot_spec("ant"), 1)
+    for n in range(3):
+        assert robots.age().item() == n
+        robots.step(np.zeros((1, 8)))
+    assert robots.step_seconds == pytest.approx(0.11)
+    found = common.closed_loop(torch.tensor([[9.0, 0.0]]), robots.place(), robots, 0.1).norm().item()
+    assert found == pytest.approx(0.85 * (0.2 + 0.8 * 3 / 40), rel=1e-4)
+
+
+def test_unstable_simulations_are_said_aloud(numbers, capsys):
+    policy, robots = SimpleNamespace(actor=OBEY, scale=0.1), Fake(3)
+    common.execute(policy, robots, torch.rand(3, 2, 2), 2, True, True)
+    assert capsys.readouterr().out == ""
+    robots.broken[1] = True
+    common.execute(policy, robots, torch.rand(3, 2, 2), 2, False, True)
+    printed = capsys.readouterr().out
+    assert printed.startswith("1 of 3 simulations were unstable") and printed.count("\n") == 1
+    assert common.execute(policy, robots, torch.rand(3, 2, 2)[:, :0], 2, True, True).shape == (0, 3, 15)
 
 
 # ---------------------------------------------------------------- measures
 
 def test_tracking_and_following_by_hand(s3, monkeypatch):
     """Robots that make 9/10 of each step end a tenth short; of three skills one after another, each anew."""
-    monkeypatch.setattr(s3, "make_robots", lambda n, threads: Fake(n))
-    monkeypatch.setattr(s3, "upside_down", lambda robots: np.arange(len(robots.at)) == 0)
+    def robots(spec, n, threads):
+        made = Fake(n)
+        made.qpos[0, 4] = 1.0  # the first one lies on its back
+        return made
+    monkeypatch.setattr(common, "Robots", robots)
     vars(s3).update(STARTS=10, SINGLE_RUN=(1, 7), MULTI_RUN=(3, 4))
     names = ["speed", "direction", "curvature"]
     policy = SimpleNamespace(actor=OBEY, decoder=Turning(0.2), names=names, relation=dict(curvature=0.2), scale=0.1,
@@ -448,7 +588,8 @@ def test_tracking_and_following_by_hand(s3, monkeypatch):
     found = s3.following(policy, False)
     # 12 steps of 0.1 x (0.5 + 0.2 z_speed), z_speed ~ U(0, 1.5); a tenth of them is missing
     assert 0.1 * 1.2 * 0.5 < found["follow_median_m"] < found["follow_p90_m"] < 0.1 * 1.2 * 0.8
-    assert found["fall_rate"] == pytest.approx(0.1)
+    assert found["fall_rate"] == pytest.approx(0.1) and found["follow_decoder_m"] == found["follow_median_m"]
+    assert 0.09 * 0.5 < found["speed_m_per_step"] < 0.09 * 0.8
     policy.decoder, policy.relation = Turning(0.2), dict(curvature=0.2)
     C, purity = s3.executed_cross_talk(policy, dict(speed=(0.0, 1.0), direction=(-1.5, 1.5), curvature=(-0.3, 0.3)), False)
     assert C[0] == pytest.approx([0.9 * 0.6, 0, 0], abs=1e-4) and C[1] == pytest.approx([0, 1, 0], abs=1e-4)
@@ -459,7 +600,7 @@ def test_tracking_and_following_by_hand(s3, monkeypatch):
 
 @pytest.mark.parametrize("experiment", ROWS)
 def test_each_row_of_experiments_from_training_to_figures(experiment, s3, fork, out):
-    done = fork(S3, *tiny(out), "--experiment", experiment)
+    done = fork(S3, *tiny(out, experiment=experiment))
     assert done.returncode == 0, done.stderr
     row, = common.read_csv(out / "results/policies.csv")
     assert row["experiment"] == experiment and int(row["updates"]) == 24 and float(row["tracking_error"]) > 0
@@ -485,6 +626,30 @@ def test_a_row_of_ones_own_and_measuring_flags(s3, inside, out):
     assert one_line(done, 2) and "HIDDEN = 16, not 24" in done.stderr
     done = inside(s3, *flags, "--train", "false", "--step_scale", 0.2)
     assert one_line(done, 2) and "STEP_SCALE = 0.1, not 0.2" in done.stderr
+
+
+@pytest.mark.parametrize("what", ["FRAME_SKIP", "CORRECTION", "ant.xml", "half_cheetah.xml", "SOFT_START", "CLASSES"])
+def test_another_physics_is_another_policy(what, s3, inside, out, tree, monkeypatch):
+    """What a training saw must be the same to resume it and to measure it; what only a measurement sees is in its row."""
+    assert inside(s3, *tiny(out)).returncode == 0
+    if what.endswith("xml"):
+        file = tree / "robots" / what
+        text = file.read_text()
+        assert 'timestep="0.01"' in text
+        file.write_text(text.replace('timestep="0.01"', 'timestep="0.008"'))
+    else:
+        monkeypatch.setattr(common, what, dict(FRAME_SKIP=4, CORRECTION=0.3, SOFT_START=3, CLASSES=common.CLASSES | dict(x=9))[what])
+    measured = {row["settings"] for row in common.read_csv(out / "results/policies.csv")}
+    for flags in (["--train", "false"], ["--resume", "true"]):
+        done = inside(s3, *tiny(out), *flags)
+        if what in ("FRAME_SKIP", "CORRECTION", "ant.xml"):
+            assert one_line(done, 2) and f"made with {what} = " in done.stderr, done.stderr
+        else:
+            assert done.returncode == 0, done.stderr
+    rows = common.read_csv(out / "results/policies.csv")
+    assert len(measured) == 1 and rows[0]["settings"] in measured  # it stays
+    if what in ("SOFT_START", "CLASSES"):
+        assert rows[1]["settings"] not in measured
 
 
 def test_a_policy_is_saved_before_it_is_measured(s3, inside, out, monkeypatch):

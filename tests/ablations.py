@@ -1,0 +1,138 @@
+"""What each departure from the paper does: python tests/ablations.py FOLDER writes results/ablations.csv
+
+FOLDER/<name>_s<seed>/policy_ant_semi_seed<seed>.pt: policies of 03 that were trained with one thing set back to the paper's
+value (name `shipped`: nothing). Each is measured as 03 does, and plans in Maze 1 as 04 does; about a minute each. Rows made
+with the same policy and constants are kept. tests/report.py makes of them a table, and the effects in README.md.
+"""
+import importlib
+import re
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
+import common  # noqa: E402
+
+NOT_YET = "not measured yet"
+MEASURES = {  # column -> in words, format, factor
+    "tracking_error": ("tracking error, open loop", ".2f", 1), "tracking_error_closed": ("tracking error, closed loop", ".2f", 1),
+    "follow_median_m_open": ("median following error, m, open loop", ".2f", 1),
+    "follow_median_m": ("median following error, m, closed loop", ".2f", 1),
+    "follow_p90_m_open": ("90 % of following errors, m, open loop", ".2f", 1),
+    "follow_p90_m": ("90 % of following errors, m, closed loop", ".2f", 1),
+    "fall_rate_open": ("falls, %, open loop", ".1f", 100), "fall_rate": ("falls, %, closed loop", ".1f", 100),
+    "slowest_speed": ("slowest skill, executed / predicted", ".2f", 1), "fastest_speed": ("fastest skill, executed / predicted", ".2f", 1),
+    "updates_per_second": ("updates a second", ".0f", 1), "maze1_distance_m": ("Maze 1, distance to the goal, m", ".1f", 1),
+    "maze1_success": ("Maze 1, success, %", ".0f", 100),
+}
+LABEL_MODELS = dict(own_axis="warm_up", beta_warm_up="own_axis", own_axis_and_warm_up="plain")  # rows `seeds` of 02
+
+
+# ---------------------------------------------------------------- measuring
+
+def prepared(stage3, stage4, folder, seed):
+    """Set both stages for the policy in a folder: its configuration in Maze 1, the policy, the digest of all that makes a row."""
+    common.parse_flags(vars(stage3), ["--out", str(folder), "--seed", str(seed), "--threads", "1"])
+    flags = f"--mazes maze1 --rewards dense --modes commands --samples 1000 --trials 20 --threads 1 --draw fig06 --policy_seeds {seed}"
+    (run,) = stage4.check(*common.parse_flags(vars(stage4), ["--out", str(folder), *flags.split()]))
+    return run
+
+
+def measured(stage3, stage4, c, policy):
+    """All MEASURES of a policy; c: its configuration in Maze 1."""
+    row = dict(tracking_error=stage3.tracking(policy, False), tracking_error_closed=stage3.tracking(policy, True))
+    for closed, end in ((False, "_open"), (True, "")):
+        row |= {name + end: value for name, value in stage3.following(policy, closed).items() if name + end in MEASURES}
+    z = stage3.traversal(policy, 0, [-1.5, 1.5])
+    executed, predicted = (np.linalg.norm(path[:, -1], axis=1) for path in (
+        stage3.roll_out(policy, z, stage3.SINGLE_RUN, False), stage3.predicted_path(policy, z, stage3.SINGLE_RUN)))
+    row["slowest_speed"], row["fastest_speed"] = (executed / predicted).tolist()
+    row["updates_per_second"] = policy.updates / policy.seconds
+    poses, _ = stage4.plan_and_execute(c, policy, stage4.skill_pool(c, policy))
+    distances = np.linalg.norm(poses[-1, :, :2] - c.goal, axis=1)
+    return row | dict(maze1_distance_m=float(distances.mean()), maze1_success=float((distances < c.epsilon).mean()))
+
+
+def main(folder):
+    stages = importlib.import_module("03_train_policy"), importlib.import_module("04_mpc_maze")
+    path, there = ROOT / "results" / "ablations.csv", sorted(path.parent for path in folder.glob("*_s*/policy_ant_semi_seed*.pt"))
+    done = {row["settings"] for row in common.read_csv(path)} if path.exists() else set()
+    if not there:
+        common.stop(f"no policy in {folder}/<name>_s<seed>/")
+    for folder in there:
+        name, seed = re.fullmatch(r"(\w+)_s(\d+)", folder.name).groups()
+        c, policy, settings = prepared(*stages, folder, int(seed))
+        if settings in done:
+            print(f"{name}, seed {seed}: in {path} already")
+            continue
+        row = dict(without=name, seed=seed) | measured(*stages, c, policy) | dict(settings=settings)
+        common.update_csv(path, [row], ("without", "seed"))
+        print(*(f"{key} {value:.3g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()), sep="  ")
+
+
+# ---------------------------------------------------------------- numbers for both READMEs
+
+def means(rows, name):
+    """The values of an ablation and of `shipped`, and what two seeds of `shipped` differ by (nan: there is one), by measure:
+    means of the seeds that both have. None if there are none."""
+    seeds = {who: {row["seed"]: row for row in rows if row["without"] == who} for who in (name, "shipped")}
+    both, found = sorted(set(seeds[name]) & set(seeds["shipped"])), {}
+    for column, (_, _, factor) in MEASURES.items():
+        own, shipped = ([factor * float(seeds[who][seed].get(column) or "nan") for seed in both] for who in (name, "shipped"))
+        every = [factor * float(row.get(column) or "nan") for row in seeds["shipped"].values()]
+        found[column] = np.mean(own or [np.nan]), np.mean(shipped or [np.nan]), np.ptp(every) if len(every) > 1 else np.nan
+    return SimpleNamespace(seeds=len(both), **found) if both else None
+
+
+def table(rows):
+    """Lines of markdown: a row for each ablation; [] if there are none."""
+    lines = []
+    for name in dict.fromkeys(row["without"] for row in sorted(rows, key=lambda row: row["without"] != "shipped")):
+        found = means(rows, name)
+        cells = [f"`{name}`", str(found.seeds) if found else "no seed in common with `shipped`"]
+        for column, (_, form, _) in MEASURES.items() if found else ():
+            own, shipped, two_seeds = getattr(found, column)
+            units = f" ({(own - shipped) / two_seeds:+.1f})" if name != "shipped" and two_seeds > 0 else ""
+            cells.append("-" if np.isnan(own) else f"{own:{form}}{units}")
+        lines.append("| " + " | ".join(cells + ["-"] * (2 + len(MEASURES) - len(cells))) + " |")
+    head = ["without", "seeds", *(words for words, _, _ in MEASURES.values())]
+    return ["| " + " | ".join(head) + " |", "|---" * len(head) + "|", *lines] if lines else []
+
+
+def effect(name, results):
+    """What a departure does, in plain words: of all measures the one that moves most without it, as a share of what two
+    seeds differ by, or of a fifth of its value if that is more (or of 2, if it is in per cent). results: reads a file of
+    results/ by its name."""
+    if name in LABEL_MODELS:
+        return label_effect(LABEL_MODELS[name], results("wetvae"))
+    found, best, moved = means(results("ablations"), name), NOT_YET, 1.0
+    if not found or name == "shipped":
+        return best
+    for column, (words, form, factor) in MEASURES.items():
+        own, shipped, two_seeds = getattr(found, column)
+        change = abs(own - shipped) / max(np.nan_to_num(two_seeds), abs(shipped) / 5, 2.0 if factor == 100 else 1e-9)
+        if change > moved:
+            best, moved = f"{words}: {own:{form}} instead of {shipped:{form}}", change
+    return best if moved > 1 else "no measure moves by more than a fifth, or than two seeds differ"
+
+
+def label_effect(labels, rows):
+    """The least purity over the seeds of 02, without and with a departure of the WET-VAE."""
+    worst = []
+    for model in (labels, "seeds"):
+        pure = [0.0 if row["purity"] == "nan" else float(row["purity"]) for row in rows
+                if (row["experiment"], row["labels"]) == ("seeds", model)]
+        worst.append((min(pure, default=None), len({row["seed"] for row in rows if (row["experiment"], row["labels"]) == (
+            "seeds", model)})))
+    if None in (worst[0][0], worst[1][0]):
+        return NOT_YET
+    return f"worst purity of {worst[0][1]} seeds: {worst[0][0]:.2f} instead of {worst[1][0]:.2f}"
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2 or not Path(sys.argv[1]).is_dir():
+        common.stop("usage: python tests/ablations.py FOLDER")
+    main(Path(sys.argv[1]))
