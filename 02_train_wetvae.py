@@ -18,8 +18,8 @@ from torch import nn
 from torch.nn import functional as F
 
 import common
-from common import (MULTI, Count, Decoder, Positive, Share, commands_of, factors_of, load, on_circle, plt, stop,
-                    weak_labels)
+from common import (MULTI, Count, Decoder, Positive, Share, commands_of, factors_of, load, on_circle, plt,
+                    stop, weak_labels)
 
 EXPERIMENT: str = "fig04_latent_traversals"  # a figure of FIGURES, with all its models, or a model of MODELS
 SEED: int = 0                # random seed, of the data set too
@@ -31,7 +31,7 @@ DATA: str = "main"           # experiment of 01 to train on
 LABELS: str = "speed direction curvature"  # the M factors of interest: a latent and a weak label y^m for each
 LABELLED: bool = True        # false: without the weak labels, the trajectory VAE (Co-Reyes et al. 2018)
 OWN_AXIS: bool = True        # p(y^m | z^m): label m is read from latent m alone (the paper: from all of z)
-CIRCLE: bool = False         # the latent of direction is an angle, for data of the full circle (the paper: no)
+CIRCLE: bool = False         # the latent of direction is an angle; needs the full circle (the paper: false)
 GAMMA: float = 10.0          # weight of the label log-likelihoods, Eq. 4
 BETA: float = 9.0            # weight of the KL divergence, Eq. 4
 BETA_WARM_UP: Share = 0.5    # share of the updates in which beta grows from 0; without it an axis can be lost
@@ -111,7 +111,7 @@ class LabelDecoders(nn.Module):
         return [self.scale[m] * read[m] @ order + self.bias[m] for m, order in enumerate(self.order)]
 
 
-# -------- p(z), and what changes if a latent is an angle, of which 3 is a whole turn (CIRCLE, not in the paper)
+# -------- p(z), and what changes if a latent is an angle, of which 3 is a whole turn (CIRCLE, ours)
 
 def angle_mean(mean, last, circle):
     """Means (B, z_dim) of the encoder, the angle as the direction of two outputs, its own and the last (B,).
@@ -123,8 +123,8 @@ def angle_mean(mean, last, circle):
 
 
 def class_order(name, classes, on_an_angle):
-    """Where the classes of a label lie along its latent, (1, classes). Zero lies between negative and positive;
-    on an angle each class is at its true direction, (2, classes): this fixes where direction 0 is."""
+    """Where the classes of a label lie along its latent, (1, classes). Zero lies between negative and
+    positive; on an angle each class is at its true direction, (2, classes): this fixes direction 0."""
     if on_an_angle:
         return on_circle(1.5 - 3 / classes * (torch.arange(0.0, classes) + 0.5)).T
     return torch.tensor([[0.0, 1.0, -1.0]]) if name in MULTI else torch.arange(0.0, classes)[None]
@@ -274,11 +274,12 @@ def main():
             relation = find_relation(decoder, names, steps, hyper.z_range)
             made = common.digest(datasets[hyper.data]["config"] | dict(SEED=0, OUT="", FIGURE=""))
             settings = constants | dict(DATASET=made)  # the same for all seeds
+            example = []
+            if hyper.labelled and names == ["speed", "direction", "curvature"]:
+                example = follow_one_skill(encoder, decoder, ranges, steps, hyper)
             common.save(OUT, "wetvae", name, SEED, settings, settings=common.digest(common.made_by(settings)),
                         decoder=decoder, encoder=encoder.state_dict(), names=names, ranges=ranges,
-                        relation=relation, length=steps, seconds=seconds, abs_corr=abs_corr)
-            if hyper.labelled and names == ["speed", "direction", "curvature"]:
-                follow_one_skill(encoder, decoder, ranges, steps, hyper)
+                        relation=relation, length=steps, seconds=seconds, abs_corr=abs_corr, example=example)
         trained[name] = load(OUT, "wetvae", name, SEED, **constants, CLASSES=common.CLASSES)
         measure(name, trained[name])
     draw_traversals(trained, columns)
@@ -292,7 +293,8 @@ def hyperparameters(name, config, given):
 
 
 def check(columns, models, datasets):
-    """End with one line, before training, if a row names what is not there or a model does not fit its data."""
+    """End with one line, before training, if a row names what is not there or a model does not fit its data.
+    """
     if EXPERIMENT not in (*FIGURES, *MODELS):
         stop(f"unknown experiment {EXPERIMENT!r}; allowed: {' '.join([*FIGURES, *MODELS])}")
     for column in columns:
@@ -312,19 +314,19 @@ def check(columns, models, datasets):
         common.need_memory(160 * hyper.hidden ** 2, "--hidden")
         angle = math.degrees(np.ptp(ranges.get("direction", [0, 0])))
         if hyper.circle and not (angle > 359 and hyper.labelled and hyper.own_axis):
-            stop(f"{at}--circle true needs direction in --labels, from 360 degrees (here {angle:.0f}), --labelled "
-                 "true and --own_axis true, as in --experiment full_circle")
+            stop(f"{at}--circle true needs direction in --labels, from 360 degrees (here {angle:.0f}), "
+                 "--labelled true and --own_axis true, as in --experiment full_circle")
         for m, factor in enumerate(ranges if hyper.labelled else ()):
             counts = np.bincount(y[:, m], minlength=common.CLASSES[factor])
-            mend = "take the full circle, --data polar" if factor in ("x", "y") else f"make other data: {make}"
+            mend = "take --data polar" if factor in ("x", "y") else f"make other data: {make}"
             if len(counts) > common.CLASSES[factor] or counts.min() < 0.005 * len(y):
-                stop(f"{at}{counts.min()} of {len(y)} trajectories are of class {counts.argmin() + 1} of {factor}: "
-                     f"leave it out of --labels, or {mend}")
+                stop(f"{at}{counts.min()} of {len(y)} trajectories are of class {counts.argmin() + 1} of "
+                     f"{factor}: leave it out of --labels, or {mend}")
 
 
 @torch.no_grad()
 def follow_one_skill(encoder, decoder, ranges, steps, hyper):
-    """Print what the model makes of the example that all four scripts follow."""
+    """Print what the model makes of the example that all four scripts follow. Returns its z."""
     factors, t = np.array([[0.6, math.radians(20), math.radians(-10)]]), np.arange(steps)
     heading = factors[:, 1:2] + factors[:, 2:] * t
     points = np.pad(0.6 * np.stack([np.cos(heading), np.sin(heading)], 2).cumsum(1), ((0, 0), (1, 0), (0, 0)))
@@ -335,7 +337,8 @@ def follow_one_skill(encoder, decoder, ranges, steps, hyper):
     print("one skill, followed: speed 0.6, direction 20 degrees, curvature -10 degrees a transition")
     print("  encoded: z =", ", ".join(f"{name} {value:+.2f}" for name, value in zip(ranges, z[0])))
     for text, rows in (("  its displacements:", x[0]), ("  decoded from z:   ", decoder(z, steps)[0][0])):
-        print(text, *(f"({dx:.2f}, {dy:.2f})" for dx, dy in rows[:10]), " end: ({:.2f}, {:.2f})".format(*rows.sum(0)))
+        print(text, *(f"({dx:.2f}, {dy:.2f})" for dx, dy in rows[:10]), " end:", rows.sum(0).numpy().round(2))
+    return z[0].tolist()
 
 
 @torch.no_grad()

@@ -95,7 +95,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs
 }
 MAY_DIFFER = (  # between a policy, or a checkpoint, and the run that uses it
     "OUT TRAIN RESUME THREADS REPORTS UPDATES Z_RANGE SINGLE_RUN MULTI_RUN TRAVERSAL NOISY STARTS FIGURE "
-    "FEEDBACK FASTEST SOFT_START SOFT_FROM CLASSES").split()
+    "FEEDBACK CLASSES").split()
 
 
 # -------- Eq. 6 and Algorithm 1, policy training
@@ -684,7 +684,7 @@ def measure(policy, ranges):
 
 def follow_one_skill(policy, source):
     """The example that all four scripts follow: its command, and a step of the robot after 40 steps of it."""
-    if METHOD != "wedis" or "example" not in source:
+    if METHOD != "wedis" or not source.get("example"):
         return
     z = torch.tensor([source["example"]]) * torch.tensor([float(name in SINGLE) for name in policy.names])
     with torch.no_grad():

@@ -46,9 +46,6 @@ CLASSES = dict(speed=4, direction=4, curvature=3, acceleration=3, x=4, y=4)  # o
 FRAME_SKIP: Count = 5     # physics steps of 0.01 s per environment step
 FEEDBACK: Share = 0.1     # closed loop: share of the distance to the reference that commands gain (paper: 0)
 CORRECTION: float = 0.2   # closed loop: the longest such gain, trajectory units
-FASTEST: Positive = 1.0   # closed loop: the longest command, trajectory units
-SOFT_START: int = 20      # environment steps in which the longest command grows to FASTEST (0: at once)
-SOFT_FROM: Share = 0.2    # ... from this share of FASTEST
 FORMAT = 4                # of the artifacts; raise it when their meaning changes
 HERE = Path(__file__).resolve().parent
 SCRIPT = {"dataset": "01_make_dataset.py", "wetvae": "02_train_wetvae.py", "policy": "03_train_policy.py"}
@@ -257,13 +254,11 @@ class Actor(nn.Module):
 # -------- execution of skills, Alg. 2, lines 13 to 19
 
 def closed_loop(c, reference, robots, scale):
-    """Commands (n, 2 or 1), trajectory units: c and a share of reference - place, both in metres."""
-    share = FEEDBACK * (2 - c.norm(dim=1, keepdim=True).clamp(max=1))  # slow commands gain up to twice it
+    """Commands (n, 2 or 1), trajectory units: c and a share of reference - place, both in metres. Slow
+    commands gain up to twice that share, or slow skills would drift before they are corrected."""
+    share = FEEDBACK * (2 - c.norm(dim=1, keepdim=True).clamp(max=1))
     gain = share * (reference - robots.place()) / scale
-    c = c + gain * (CORRECTION / gain.norm(dim=1, keepdim=True).clamp(min=CORRECTION or 1.0))
-    started = (robots.age() / SOFT_START).clamp(max=1) if SOFT_START else 1.0
-    longest = torch.full_like(c[:, :1], FASTEST) * (SOFT_FROM + (1 - SOFT_FROM) * started)
-    return c * (longest / torch.maximum(c.norm(dim=1, keepdim=True), longest).clamp(min=1e-9))
+    return c + gain * (CORRECTION / gain.norm(dim=1, keepdim=True).clamp(min=CORRECTION or 1.0))
 
 
 def execute(policy, robots, commands, hold, closed, deterministic):

@@ -23,8 +23,8 @@ def dot(place, *colour):
 
 
 def for_this_page_alone(web_server):
-    """Change mujoco's server before it starts: it listens on this machine only, and answers its own page only.
-    Any page that a browser has open could else drive the Ant. Returns an event: the changed server listens."""
+    """Change mujoco's server before it starts: it listens on this machine only, and answers its own page
+    only. Any page that a browser has open could else drive the Ant. Returns an event: the server listens."""
     bind, serve, listens = web_server.bind_public_socket, web_server.serve, threading.Event()
     web_server.bind_public_socket = lambda host, port: bind("127.0.0.1", port)  # else on every interface
 

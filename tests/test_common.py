@@ -219,7 +219,7 @@ def test_constants_of_common_are_checked_too(tmp_path):
     text = (ROOT / "common.py").read_text()
     shutil.copy(ROOT / f"{S1}.py", tmp_path)
     shutil.copytree(ROOT / "robots", tmp_path / "robots")
-    for old, new, message in (("SOFT_START: int = 20 ", "SOFT_START: int = 2.5 ", "SOFT_START in common.py is 2.5, but must be a whole"),
+    for old, new, message in (("FRAME_SKIP: Count = 5 ", "FRAME_SKIP: Count = 2.5 ", "FRAME_SKIP in common.py is 2.5, but must be a whole"),
                               ("FEEDBACK: Share = 0.1 ", "FEEDBACK: Share = -1 ", "FEEDBACK in common.py is -1, but must be a number from")):
         assert text.count(old) == 1
         (tmp_path / "common.py").write_text(text.replace(old, new))
@@ -435,14 +435,14 @@ def test_a_write_that_is_stopped_leaves_the_old_file_and_nothing_else(tmp_path, 
 def test_an_artifact_knows_the_constants_of_common_and_the_robots_files(tmp_path, monkeypatch, capsys):
     common.save(tmp_path, "policy", "x", 0, dict(A=1), v=1)
     config = common.load(tmp_path, "policy", "x", 0)["config"]
-    for name in "FRAME_SKIP FEEDBACK CORRECTION FASTEST SOFT_START SOFT_FROM CLASSES".split():
+    for name in "FRAME_SKIP FEEDBACK CORRECTION CLASSES".split():
         assert config[name] == getattr(common, name), name
     for name in ("ant.xml", "half_cheetah.xml"):
         assert config[name] == hashlib.sha256((ROOT / "robots" / name).read_bytes()).hexdigest()[:16]
     before = common.digest(config)
     assert common.digest(dict(reversed(config.items()))) == before == common.digest(common.made_by(dict(A=1)))
     assert len({before, *(common.digest(config | change) for change in (dict(A=2), dict(FRAME_SKIP=6), dict(B=1)))}) == 4
-    for name, value in dict(FRAME_SKIP=4, CORRECTION=0.0, SOFT_START=0, CLASSES=common.CLASSES | dict(x=9)).items():
+    for name, value in dict(FRAME_SKIP=4, CORRECTION=0.0, FEEDBACK=0.0, CLASSES=common.CLASSES | dict(x=9)).items():
         monkeypatch.setattr(common, name, value)
         made = common.made_by(dict(A=1))
         assert common.digest(made) != before

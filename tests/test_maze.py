@@ -545,7 +545,7 @@ def test_only_what_was_made_with_the_same_settings_is_used_again(s4, stage, monk
         assert {row["settings"] for row in shown[-1]}.isdisjoint(row["settings"] for row in first.rows), change
         assert {row["policy_seed"] for row in shown[-1]} == {"0"}  # another policy is not pooled into the figure
     assert "already" in stage(**flags, policy_seeds="0").out
-    for name, value in (("FEEDBACK", 0.05), ("CORRECTION", 0.1), ("SOFT_START", 0)):
+    for name, value in (("FEEDBACK", 0.05), ("CORRECTION", 0.1)):
         monkeypatch.setattr(common, name, value)
         assert "already" not in stage(**flags, policy_seeds="0").out, name
     s4.MAZE["maze1"] = dict(WALLS=s4.HULL)

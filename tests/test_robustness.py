@@ -272,7 +272,12 @@ TOO_LONG = {(S3, "UPDATES"): 1_920_000}  # a day
 NO_NUMBER = {(S4, "POOL"): "no pool"}
 ONE_LINE = {  # values that are in range and rightly end in one line; of a learning rate also: with code 1
     (S1, "LENGTH"): [1], (S1, "DIRECTION"): [0], (S1, "CURVATURE"): [0], (S1, "SPEED_LOW"): [1], (S1, "STRAIGHT"): [1],
-    (S1, "ACCELERATION"): [0, 1], (S3, "DISCOUNT"): [1], (S3, "Z_DIM"): [1], (S4, "EPISODE"): [1], (S4, "PORT"): []}
+    (S1, "ACCELERATION"): [0, 1], (S3, "DISCOUNT"): [1], (S3, "Z_DIM"): [1], (S4, "EPISODE"): [1],
+    (S2, "SEED"): [1], (S3, "SEED"): [1]}  # there is no such data set, or decoder
+OFF = {  # constants that 0 switches off, whatever their declared types
+    S1: "SPEED_LOW STRAIGHT", S2: "GAMMA BETA BETA_WARM_UP",
+    S3: "RELABELLED CORRECTED DECAY_FROM AVERAGED DISCOUNT SMOOTHING REWARD_SCALE TEMPERATURE FLOOR_START FLOOR_END FLOOR_FROM "
+        "FLOOR_UNTIL EXPLORE KL_WEIGHT", S4: "LOOK_AHEAD PENALTY REWARD_WEIGHT EPSILON RADIUS Z_RANGE"}
 MAY_DIVERGE = [(S2, "LEARNING_RATE"), (S3, "LEARNING_RATE")]
 
 
@@ -290,9 +295,11 @@ def runs(stage, name):
             found += [(-3, 0.5), "-3 4"]
         if name == "POLICY_SEEDS":
             found = [0]
+    if name in OFF[stage].split():
+        found = [0, *found]
     if (stage, name) in PAPER and (stage, name) not in TOO_LONG and (stage, name) not in NO_NUMBER:
         found = [*found, PAPER[stage, name]]
-    return list(dict.fromkeys(tuple(one) if isinstance(one, list) else one for one in found if name not in SMALL or one))
+    return list(dict.fromkeys(tuple(one) if isinstance(one, list) else one for one in found))
 
 
 def test_the_papers_values_are_found():
@@ -306,11 +313,7 @@ def test_the_papers_values_are_found():
 def test_values_that_must_run(stage, name, small):
     """Exit 0: 0 switches off, 1 of each count, the paper's value, whole numbers for fractions. Others that are in range, and
     make no sense, are listed and end in one line."""
-    for value in runs(stage, name):
-        if name in DRIVING or (stage, name, value) == (S4, "SEED", 0):
-            continue
-        if (stage, name) == (S3, "SEED") and value or (stage, name) == (S2, "SEED") and value:
-            continue  # there are no data of this seed here
+    for value in runs(stage, name) if name not in DRIVING else ():
         done = small(stage, name, value)
         if value in ONE_LINE.get((stage, name), []):
             assert one_line(done, 2), (value, done.stderr)
@@ -318,6 +321,18 @@ def test_values_that_must_run(stage, name, small):
             assert one_line(done, 1) and "not finite" in done.stderr, (value, done.stderr)
         else:
             assert done.returncode == 0 and not done.stderr, (value, done.stderr)
+
+
+@pytest.mark.parametrize("stage", [S3, S4])
+@pytest.mark.parametrize("name", "FEEDBACK CORRECTION".split())
+def test_what_is_switched_off_in_common_runs(stage, name, small, out, monkeypatch):
+    monkeypatch.setattr(common, name, 0)
+    done = small(stage, "FIGURE" if stage == S3 else "", "x")
+    assert done.returncode == 0 and not done.stderr and "unstable" not in done.stdout, (done.stdout, done.stderr)
+    rows = common.read_csv(out / f"results/{'policies' if stage == S3 else 'mazes'}.csv")
+    distance = [float(row["tracking_error_closed" if stage == S3 else "final_distance"]) for row in rows]
+    assert np.isfinite(distance).all()
+    assert common.load(out, "policy", "ant_semi", 0)["config"][name] == 0
 
 
 @pytest.mark.parametrize("flags", [["--goal", "3 -4"], ["--goal", "-3,4"], ["--goal", "-.5 -3e0"], ["--samples", "3,5"],
@@ -338,21 +353,21 @@ def test_numbers_that_do_not_fit_the_mazes(flags, message, small):
     assert one_line(done, 2) and message in done.stderr, done.stderr
 
 
-@pytest.mark.parametrize("what", ["FRAME_SKIP", "ant.xml", "half_cheetah.xml", "CLASSES", "FASTEST"])
+@pytest.mark.parametrize("what", ["FRAME_SKIP", "ant.xml", "half_cheetah.xml", "CLASSES", "FEEDBACK"])
 def test_mazes_are_for_policies_that_learnt_with_the_same_physics(what, small, out, tree, monkeypatch):
     assert small(S4).returncode == 0
     if what.endswith("xml"):
         file = tree / "robots" / what
         file.write_text(file.read_text().replace("<!--", "<!-- edited ", 1) + "<!-- edited -->")
     else:
-        monkeypatch.setattr(common, what, dict(FRAME_SKIP=4, CLASSES=common.CLASSES | dict(x=5), FASTEST=0.5)[what])
+        monkeypatch.setattr(common, what, dict(FRAME_SKIP=4, CLASSES=common.CLASSES | dict(x=5), FEEDBACK=0.5)[what])
     done = small(S4)
     if what in ("FRAME_SKIP", "ant.xml"):
         assert one_line(done, 2) and f"made with {what} = " in done.stderr, done.stderr
         return
     assert done.returncode == 0, done.stderr
     settings = [row["settings"] for row in common.read_csv(out / "results/mazes.csv")]
-    assert len(settings) == 12 if what == "FASTEST" else len(settings) in (6, 12)  # a row of other settings stays
+    assert len(settings) == 12 if what == "FEEDBACK" else len(settings) in (6, 12)  # a row of other settings stays
     assert small(S4).returncode == 0 and len(common.read_csv(out / "results/mazes.csv")) == len(settings)
 
 
