@@ -97,6 +97,52 @@ def test_a_port_in_use_is_one_line(folder):
     assert process.returncode == 2 and len(err.splitlines()) == 1 and "--port" in err
 
 
+def answer(port, *lines, body=b""):
+    """The status line of what the server answers to a raw request, or "" if it hangs up."""
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as client:
+        client.sendall("\r\n".join([*lines, "", ""]).encode() + body)
+        try:
+            return client.recv(4096).decode(errors="replace").split("\r\n")[0]
+        except ConnectionError:
+            return ""
+
+
+def test_a_foreign_page_gets_nothing_and_the_own_one_goes_on(folder):
+    """Any page that the user's browser has open may send requests to this machine."""
+    process = run(folder, "--port", "0", "--seconds", "40")
+    upgrade = ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13",
+               "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="]
+    try:
+        port = port_of(process)
+        opened(port)
+        own, get, page = f"Host: 127.0.0.1:{port}", "GET / HTTP/1.1", "GET /ui HTTP/1.1"
+        for name in ("127.0.0.1", "localhost"):
+            assert "101" in answer(port, page, f"Host: {name}:{port}", f"Origin: http://{name}:{port}", *upgrade)
+            assert "200" in answer(port, get, f"Host: {name}:{port}")
+        for origin in ("http://evil.example", f"http://127.0.0.1:{port + 1}", f"https://127.0.0.1:{port}", "null"):
+            assert "403" in answer(port, page, own, f"Origin: {origin}", *upgrade), origin
+        assert "403" in answer(port, page, own, *upgrade)  # no browser leaves Origin out here
+        for host in ("evil.example", f"evil.example:{port}", f"127.0.0.1:{port + 1}", "127.0.0.1"):
+            assert "403" in answer(port, get, f"Host: {host}"), host
+            assert "403" in answer(port, page, f"Host: {host}", f"Origin: http://{host}", *upgrade), host
+        assert "200" not in answer(port, get)
+        for method in ("POST", "PUT"):
+            refused = answer(port, f"{method} /drop HTTP/1.1", own, "Content-Length: 100000", body=b"x" * 100_000)
+            assert "200" not in refused and "101" not in refused
+        assert "403" in answer(port, "GET /drop/mine.xml HTTP/1.1", own)
+        with socket.create_connection(("127.0.0.1", port), timeout=20) as client:  # garbage after a valid handshake
+            client.sendall("\r\n".join([page, own, f"Origin: http://127.0.0.1:{port}", *upgrade, "", ""]).encode())
+            assert b"101" in client.recv(4096)
+            client.sendall(b"\xff\x00garbage" * 1000)
+        time.sleep(1)
+        assert process.poll() is None and opened(port).status == 200  # the simulation goes on
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+        assert process.returncode == 0 and re.search(r"[1-9]\d* steps", out) and "Traceback" not in err, err
+    finally:
+        process.kill()
+
+
 OTHER_MUJOCO = {
     "no web viewer": "import mujoco.studio\nsys.modules['mujoco.studio.web_viewer'] = None",
     "no slider": "from mujoco.studio.dear_imgui import dear_imgui as gui\ndel gui.SliderFloat",
