@@ -373,7 +373,8 @@ def test_configurations_are_each_method_maze_policy_mode_reward_look_ahead_and_n
 @pytest.mark.parametrize("method", ["wedis", "wedis_s", "wedis_nts", "dads", "dads_speed", "sectar"])
 def test_each_row_of_methods_runs(s4, stage, method):
     assert method in s4.METHODS and len(s4.METHODS) == 6
-    done = stage(method=method, mazes="maze1", draw="fig03 fig08 fig17", episode=40, rewards="sparse", hold=1, trials=1)
+    done = stage(method=method, mazes="maze1", draw="fig03 fig08 fig17", episode=40, rewards="sparse", hold=1, trials=1,
+                 policy_seeds=0)  # SeCTAR's row has two
     assert done.code == 0, done.err
     expected = dict(wedis=MODES, wedis_s=MODES[:2], wedis_nts=MODES[:2]).get(method, MODES[:1])
     assert [row["mode"] for row in done.rows] == expected
@@ -399,7 +400,8 @@ def test_each_row_of_experiments_runs(s4, stage, experiment, out, policies, monk
         found = {(c.method, c.mode, c.policy_seed) for c, _, _ in runs(s4, out, experiment=experiment)}
         wanted = [("wedis", "closed"), *((method, mode) for method in ("wedis", "wedis_s", "wedis_nts") for mode in MODES[:2]),
                   *((method, "printed") for method in ("dads", "dads_speed", "sectar"))]
-        assert found == {(*one, seed) for one in wanted for seed in (0, 1, 2)}
+        shipped = dict(dads=(0,), dads_speed=(0,), sectar=(0, 1))  # a row of METHODS overrides one of EXPERIMENTS
+        assert found == {(*one, seed) for one in wanted for seed in shipped.get(one[0], (0, 1, 2))}
         assert {c.trials for c, _, _ in runs(s4, out, experiment=experiment)} == {20}
         flags |= dict(policy_seeds=0)
     monkeypatch.setattr(s4, "can_render", lambda: True)
