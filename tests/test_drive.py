@@ -9,13 +9,17 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from contextlib import suppress
 from pathlib import Path
 
 import common
+import numpy as np
 import pytest
 import torch
 from conftest import ROOT, load_policy
 from test_maze import make_policy
+from websockets.exceptions import ConnectionClosed, ConnectionClosedError, InvalidStatus
+from websockets.sync.client import connect
 
 
 @pytest.fixture(scope="module")
@@ -97,50 +101,145 @@ def test_a_port_in_use_is_one_line(folder):
     assert process.returncode == 2 and len(err.splitlines()) == 1 and "--port" in err
 
 
+UPGRADE = ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="]
+
+
 def answer(port, *lines, body=b""):
-    """The status line of what the server answers to a raw request, or "" if it hangs up."""
+    """The status that the server answers to a raw request, or "" if it hangs up."""
     with socket.create_connection(("127.0.0.1", port), timeout=20) as client:
         client.sendall("\r\n".join([*lines, "", ""]).encode() + body)
         try:
-            return client.recv(4096).decode(errors="replace").split("\r\n")[0]
+            return client.recv(4096).decode(errors="replace")[9:12]
         except ConnectionError:
             return ""
 
 
-def test_a_foreign_page_gets_nothing_and_the_own_one_goes_on(folder):
-    """Any page that the user's browser has open may send requests to this machine."""
-    process = run(folder, "--port", "0", "--seconds", "40")
-    upgrade = ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13",
-               "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="]
+def page_of(port, path, name="127.0.0.1"):
+    """A WebSocket as the page opens it. The page's two sockets have the same sid."""
+    return connect(f"ws://{name}:{port}{path}", origin=f"http://{name}:{port}", proxy=None, open_timeout=20, close_timeout=2)
+
+
+def moves_on(page):
+    """Whether a page that watches /state is sent two different states: the simulation runs."""
+    states = set()
+    for _ in range(400):
+        message = page.recv(timeout=20)
+        if isinstance(message, bytes):
+            states.add(message)
+            page.send("state_ack")
+        if len(states) == 2:
+            return True
+    return False
+
+
+def own_page_works(port):
+    """The own page is there, and a new visitor drives the Ant: so nobody else does."""
+    assert opened(port).status == 200
+    with page_of(port, "/state?sid=own") as state, page_of(port, "/ui?sid=own"):
+        for _ in range(400):
+            message = state.recv(timeout=20)
+            if isinstance(message, str) and "role=controller" in message:
+                break
+        else:
+            raise AssertionError("somebody else drives")
+        assert moves_on(state)
+
+
+@pytest.fixture
+def port(folder):
+    """The port of a page that must live through the test, say nothing of errors and end by Ctrl-C."""
+    process = run(folder, "--port", "0")
     try:
         port = port_of(process)
-        opened(port)
-        own, get, page = f"Host: 127.0.0.1:{port}", "GET / HTTP/1.1", "GET /ui HTTP/1.1"
-        for name in ("127.0.0.1", "localhost"):
-            assert "101" in answer(port, page, f"Host: {name}:{port}", f"Origin: http://{name}:{port}", *upgrade)
-            assert "200" in answer(port, get, f"Host: {name}:{port}")
-        for origin in ("http://evil.example", f"http://127.0.0.1:{port + 1}", f"https://127.0.0.1:{port}", "null"):
-            assert "403" in answer(port, page, own, f"Origin: {origin}", *upgrade), origin
-        assert "403" in answer(port, page, own, *upgrade)  # no browser leaves Origin out here
-        for host in ("evil.example", f"evil.example:{port}", f"127.0.0.1:{port + 1}", "127.0.0.1"):
-            assert "403" in answer(port, get, f"Host: {host}"), host
-            assert "403" in answer(port, page, f"Host: {host}", f"Origin: http://{host}", *upgrade), host
-        assert "200" not in answer(port, get)
-        for method in ("POST", "PUT"):
-            refused = answer(port, f"{method} /drop HTTP/1.1", own, "Content-Length: 100000", body=b"x" * 100_000)
-            assert "200" not in refused and "101" not in refused
-        assert "403" in answer(port, "GET /drop/mine.xml HTTP/1.1", own)
-        with socket.create_connection(("127.0.0.1", port), timeout=20) as client:  # garbage after a valid handshake
-            client.sendall("\r\n".join([page, own, f"Origin: http://127.0.0.1:{port}", *upgrade, "", ""]).encode())
-            assert b"101" in client.recv(4096)
-            client.sendall(b"\xff\x00garbage" * 1000)
-        time.sleep(1)
-        assert process.poll() is None and opened(port).status == 200  # the simulation goes on
+        own_page_works(port)
+        yield port
+        own_page_works(port)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
-        assert process.returncode == 0 and re.search(r"[1-9]\d* steps", out) and "Traceback" not in err, err
+        assert process.returncode == 0 and not err and re.search(r"\n[1-9]\d* steps, ", out)
     finally:
         process.kill()
+
+
+def test_both_names_of_this_machine_are_its_own(port):
+    for name in ("127.0.0.1", "localhost"):
+        with page_of(port, "/state?sid=one", name) as state:
+            assert moves_on(state)
+        assert answer(port, "GET / HTTP/1.1", f"Host: {name}:{port}") == "200"
+
+
+def test_a_foreign_page_drives_nothing(port):
+    """Any page that the user's browser has open may send requests to this machine, with its own Origin."""
+    host, own = f"Host: 127.0.0.1:{port}", f"Origin: http://127.0.0.1:{port}"
+    for origin in ("http://evil.example", f"http://evil.example:{port}", f"http://127.0.0.1:{port + 1}", "http://127.0.0.1",
+                   f"https://127.0.0.1:{port}", f"http://localhost:{port}", f"http://127.0.0.1:{port}.evil.example", "null", ""):
+        for path in ("/ui?sid=evil", "/state?sid=evil", "/drop?sid=evil"):
+            assert answer(port, f"GET {path} HTTP/1.1", host, f"Origin: {origin}", *UPGRADE) == "403", (origin, path)
+        assert answer(port, "GET /model HTTP/1.1", host, f"Origin: {origin}") == "403", origin
+        own_page_works(port)
+    assert answer(port, "GET /ui HTTP/1.1", host, *UPGRADE) == "403"  # a browser never leaves it out here
+    assert answer(port, "GET /ui HTTP/1.1", host, own, "Origin: http://evil.example", *UPGRADE) == "403"
+
+
+def test_a_foreign_host_gets_nothing(port):
+    """A foreign name may be made to lead to this machine (DNS rebinding): its page has the right Origin for its Host."""
+    for host in ("evil.example", f"evil.example:{port}", f"127.0.0.1:{port + 1}", "127.0.0.1", "localhost", f"127.0.0.2:{port}",
+                 f"[::1]:{port}", f"127.0.0.1:{port}.evil.example", f"evil@127.0.0.1:{port}", ""):
+        assert answer(port, "GET / HTTP/1.1", f"Host: {host}") == "403", host
+        assert answer(port, "GET /ui HTTP/1.1", f"Host: {host}", f"Origin: http://{host}", *UPGRADE) == "403", host
+        own_page_works(port)
+    assert answer(port, "GET / HTTP/1.1") == "403"
+    assert answer(port, "GET / HTTP/1.0") == "403"
+    assert answer(port, "GET /ui HTTP/1.1", f"Origin: http://127.0.0.1:{port}", *UPGRADE) == "403"
+    assert answer(port, "GET / HTTP/1.1", f"Host: 127.0.0.1:{port}", "Host: evil.example") == "403"
+
+
+def test_no_upload_is_kept(port):
+    """mujoco keeps what the page that drives sends to /drop, as large as 64 MB each; here not even that page may."""
+    host, own = f"Host: 127.0.0.1:{port}", f"Origin: http://127.0.0.1:{port}"
+    with page_of(port, "/ui?sid=driver"), pytest.raises(InvalidStatus, match="403"):
+        page_of(port, "/drop?sid=driver")
+    own_page_works(port)
+    for method in ("POST", "PUT"):
+        for path in ("/drop", "/"):
+            for length in ("Content-Length: 100000", "Transfer-Encoding: chunked"):
+                refused = answer(port, f"{method} {path} HTTP/1.1", host, own, length, body=b"x" * 100_000)
+                assert refused not in ("200", "101", "426"), (method, path, length)
+            foreign = answer(port, f"{method} {path} HTTP/1.1", host, "Origin: http://evil.example")
+            assert foreign == "403", (method, path)
+        own_page_works(port)
+    for path in ("/ui?sid=large", "/state?sid=large"):
+        with page_of(port, path) as page:
+            page.send(bytes(2 ** 21))
+            with pytest.raises(ConnectionClosedError, match="1009"):  # too big
+                for _ in range(400):
+                    page.recv(timeout=20)
+        own_page_works(port)
+
+
+def test_garbage_drops_its_sender_alone(port):
+    rng, own = np.random.default_rng(0), [f"Host: 127.0.0.1:{port}", f"Origin: http://127.0.0.1:{port}"]
+    with page_of(port, "/state?sid=watches") as other:
+        for path in ("/ui?sid=bad", "/state?sid=bad"):  # no frame of a WebSocket
+            with socket.create_connection(("127.0.0.1", port), timeout=20) as client:
+                client.sendall("\r\n".join([f"GET {path} HTTP/1.1", *own, *UPGRADE, "", ""]).encode())
+                assert b" 101 " in client.recv(4096)
+                client.sendall(b"\xff\x00garbage" * 1000)
+            assert moves_on(other)
+        # Frames of which the viewer's own protocol understands nothing. It hangs up while they are written: SIGPIPE.
+        for first in (bytes(120), rng.bytes(120), rng.bytes(5000), b"", "text") * 2:
+            with page_of(port, "/ui?sid=bad") as page, suppress(ConnectionClosed):
+                page.send(first)
+                time.sleep(0.2)
+                page.send(rng.bytes(100_000))
+                page.send(rng.bytes(100_000))
+            assert moves_on(other)
+            own_page_works(port)
+        with page_of(port, "/ui?sid=bad"), page_of(port, "/state?sid=bad") as page:  # it drives: a camera, a theme ..
+            for message in (b"", rng.bytes(88), rng.bytes(5000), b"\xff" * 88, "theme=\u2603", "max_spectators=x", "\u2603"):
+                page.send(message)
+            assert moves_on(page)
+        assert moves_on(other)
 
 
 OTHER_MUJOCO = {
