@@ -2,15 +2,15 @@
 
 Draws the factors of interest and makes of each draw a trajectory of T transitions from the origin. Writes,
 below runs/, a figure and dataset_<experiment>_seed<seed>.npz with trajectories (N, T + 1, 2 or 1), factors
-(N, M), their names (M,) and ranges (M, 2), angles in radians. Takes 5 seconds.
-Expect, n = 100,000: a mean speed of 0.50, and 20 % of the trajectories straight.
+(N, M), their names (M,) and ranges (M, 2), angles in radians. Takes 5 seconds. Expect, n = 100,000: a mean
+speed of 0.50, and 20 % of the trajectories straight.
 """
 import math
 
 import numpy as np
 
 import common
-from common import Count, Degrees, Positive, Share, plt, stop, weak_labels
+from common import Count, Degrees, Positive, Share, Signed, plt, stop, weak_labels
 
 EXPERIMENT: str = "main"      # row of EXPERIMENTS below
 SEED: int = 0                 # random seed of the whole chain: data, decoder, policy
@@ -20,8 +20,8 @@ FIGURE: str = ""              # name of the figure, if factors have one ("": dat
 TRAJECTORIES: Count = 100_000  # N, App. A.1.1
 LENGTH: Count = 5             # T, transitions per trajectory
 FACTORS: str = "speed direction curvature"  # without direction trajectories have one dimension
-SPEED_LOW: float = 0.0        # speed ~ U(SPEED_LOW, SPEED_HIGH), Table 1, trajectory units per transition
-SPEED_HIGH: Positive = 1.0    # in one dimension ~ U(-SPEED_HIGH, SPEED_HIGH)
+SPEED_LOW: Signed = 0.0       # speed ~ U(SPEED_LOW, SPEED_HIGH), Table 1, trajectory units per transition
+SPEED_HIGH: Positive = 1.0    # in one dimension a speed has a sign
 DIRECTION: Degrees = 90.0     # direction ~ U(-DIRECTION, DIRECTION), degrees: the right-sided semicircle
 CURVATURE: Degrees = 30.0     # curvature ~ U(-CURVATURE, CURVATURE), degrees per transition; + turns left
 ACCELERATION: float = 0.2     # acceleration ~ U(-ACCELERATION, ACCELERATION) times the speed per transition
@@ -31,9 +31,11 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs
     "main": dict(FIGURE="fig09_dataset"),
     "full": dict(DIRECTION=180.0),                                        # the Ant of Fig 15
     "polar": dict(FACTORS="speed direction", DIRECTION=180.0),            # Fig 11: radius and angle
-    "speed_acc": dict(FACTORS="speed acceleration"),                      # Fig 12 and 16, in one dimension
+    "speed_acc": dict(FACTORS="speed acceleration", SPEED_LOW=-1.0),      # Fig 12 and 16, in one dimension
     "four_factors": dict(FACTORS="speed direction curvature acceleration", DIRECTION=180.0),  # Fig 13
 }
+# The example that all four scripts follow
+EXAMPLE = dict(speed=np.array([0.6]), direction=np.radians([20.0]), curvature=np.radians([-10.0]))
 
 
 def make_trajectories(speed, direction=None, curvature=0.0, acceleration=0.0, length=5):
@@ -50,8 +52,7 @@ def make_trajectories(speed, direction=None, curvature=0.0, acceleration=0.0, le
 
 def main():
     config, _ = common.parse_flags(globals())
-    slowest = SPEED_LOW if "direction" in FACTORS.split() else -SPEED_HIGH
-    limits = dict(speed=(slowest, SPEED_HIGH), direction=(-DIRECTION, DIRECTION),
+    limits = dict(speed=(SPEED_LOW, SPEED_HIGH), direction=(-DIRECTION, DIRECTION),
                   curvature=(-CURVATURE, CURVATURE), acceleration=(-ACCELERATION, ACCELERATION))
     check(FACTORS.split(), limits)
     names = [name for name in limits if name in FACTORS.split()]  # this order is that of z in all stages
@@ -64,16 +65,22 @@ def main():
             factors[name] *= rng.random(TRAJECTORIES) >= STRAIGHT
     trajectories = make_trajectories(**factors, length=LENGTH)  # Alg. 1, "Generate"
     ranges = {name: unit[name] * np.array(limits[name]) for name in names}
+    example = {}
+    if names == list(EXAMPLE):
+        example["example"] = make_trajectories(**EXAMPLE, length=LENGTH).astype(np.float32)
+        example["example_factors"] = np.stack(list(EXAMPLE.values()), 1)
     path = common.save(OUT, "dataset", EXPERIMENT, SEED, config, trajectories=trajectories.astype(np.float32),
                        factors=np.stack(list(factors.values()), 1).astype(np.float32),
-                       names=np.array(names), ranges=np.array(list(ranges.values())))
+                       names=np.array(names), ranges=np.array(list(ranges.values())), **example)
     print(f"wrote {path}\nTable 1, as drawn: {TRAJECTORIES} trajectories of T = {LENGTH}; angles in degrees")
     for name, values in factors.items():
         shown, zero = values / unit[name], np.mean(values == 0)
         print(f"{name:12}  U{limits[name]!s:16}  mean {shown.mean():.3f}  min {shown.min():.3f}  "
               f"max {shown.max():.3f}  exactly 0: {zero:.3f}")
-    if names[:3] == ["speed", "direction", "curvature"]:
-        follow_one_skill(ranges)
+    if example:
+        print("one skill, followed: speed 0.6, direction 20 degrees, curvature -10 degrees a transition")
+        print("  its points:", *(f"({x:.2f}, {y:.2f})" for x, y in example["example"][0]), " its labels:",
+              *weak_labels(EXAMPLE, names, ranges)[0] + 1)
         draw(trajectories[:4000], {name: values[:4000] for name, values in factors.items()}, ranges)
 
 
@@ -81,27 +88,16 @@ def main():
 
 def check(names, limits):
     """End with one line if these constants make no data set from which the factors can be learnt."""
-    two = "direction" in names or not (SPEED_LOW or "curvature" in names)
-    if "speed" not in names or not set(names) <= set(limits) or not two:
-        stop(f"--factors {FACTORS!r} must name speed, and besides it only {' '.join(limits)}; curvature and "
-             "--speed_low need direction: one dimension has neither turns nor a least speed")
+    if "speed" not in names or not set(names) <= set(limits):
+        stop(f"--factors {FACTORS!r} must name speed, and besides it only {' '.join(limits)}")
+    if "curvature" in names and "direction" not in names or "direction" in names and SPEED_LOW < 0:
+        stop("--factors curvature needs direction; with direction --speed_low must be at least 0")
     for name in names:
         if name in common.MULTI and LENGTH == 1:
             stop(f"{name} needs --length 2 or more: it is a change from one transition to the next")
         if name in common.MULTI and STRAIGHT == 1 or limits[name][0] >= limits[name][1]:
             stop(f"{name} never changes: widen its range, lower --straight, or leave it out of --factors")
-    if "acceleration" in names and ACCELERATION * (LENGTH - 1) >= 1:
-        stop(f"--acceleration must be less than {1 / (LENGTH - 1):.3g}, or the last transitions go back")
     common.need_memory(100 * TRAJECTORIES * (LENGTH + 1), "--trajectories or --length")
-
-
-def follow_one_skill(ranges):
-    """The example that all four scripts follow."""
-    factors = dict(speed=np.array([0.6]), direction=np.radians([20.0]), curvature=np.radians([-10.0]))
-    points = make_trajectories(**factors, length=LENGTH)[0]
-    print("one skill, followed: speed 0.6, direction 20 degrees, curvature -10 degrees a transition")
-    print("  its points:", *(f"({x:.2f}, {y:.2f})" for x, y in points), " its labels:",
-          *weak_labels(factors, list(factors), ranges)[0] + 1)
 
 
 def draw(trajectories, factors, ranges):
@@ -117,10 +113,9 @@ def draw(trajectories, factors, ranges):
     fan.set(title="labels (speed, direction)", xlabel="first transition: x", ylabel="y", aspect="equal")
     colours = (common.GREY, common.BLUE, common.RED)
     for label, (text, sign) in enumerate((("1: straight", 0), ("2: left", 1), ("3: right", -1))):
-        for share in (1 / 3, 2 / 3, 1):
-            turn = np.array([sign * share * ranges["curvature"][1]])
-            path = make_trajectories(np.ones(1), np.zeros(1), turn, length=LENGTH)[0]
-            turns.plot(*path.T, "o-", ms=3, color=colours[label], label=text if share == 1 else None)
+        turn = sign * ranges["curvature"][1] * np.array([1 / 3, 2 / 3, 1])
+        paths = make_trajectories(np.ones(3), np.zeros(3), turn, length=LENGTH)
+        turns.plot(*paths.T, "o-", ms=3, color=colours[label], label=[text, "_", "_"])
     turns.set(title=f"label curvature, {CURVATURE:g} degrees at most", xlabel="x", aspect="equal")
     turns.legend(loc="upper left", fontsize=8, handlelength=1)
     for path, label in zip(trajectories[:300], curvature):

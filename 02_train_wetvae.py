@@ -18,8 +18,8 @@ from torch import nn
 from torch.nn import functional as F
 
 import common
-from common import (MULTI, Count, Decoder, Positive, Share, commands_of, factors_of, load, on_circle, plt,
-                    stop, weak_labels)
+from common import (MULTI, Count, Decoder, Positive, Share, commands_of, factors_of, load, plt, stop,
+                    weak_labels)
 
 EXPERIMENT: str = "fig04_latent_traversals"  # a figure of FIGURES, with all its models, or a model of MODELS
 SEED: int = 0                # random seed, of the data set too
@@ -31,7 +31,6 @@ DATA: str = "main"           # experiment of 01 to train on
 LABELS: str = "speed direction curvature"  # the M factors of interest: a latent and a weak label y^m for each
 LABELLED: bool = True        # false: without the weak labels, the trajectory VAE (Co-Reyes et al. 2018)
 OWN_AXIS: bool = True        # p(y^m | z^m): label m is read from latent m alone (the paper: from all of z)
-CIRCLE: bool = False         # the latent of direction is an angle; needs the full circle (the paper: false)
 GAMMA: float = 10.0          # weight of the label log-likelihoods, Eq. 4
 BETA: float = 9.0            # weight of the KL divergence, Eq. 4
 BETA_WARM_UP: Share = 0.5    # share of the updates in which beta grows from 0; without it an axis can be lost
@@ -48,13 +47,12 @@ LINE = dict(DATA="speed_acc", LABELS="speed acceleration", EPOCHS=24, BETA=4, Z_
 FOUR = dict(DATA="four_factors", LABELS="speed direction curvature acceleration", EPOCHS=60, BETA=4)
 WEIGHTS = ((9, 0), (9, 1), (1, 10), (3, 10), (9, 10))  # beta and gamma in Fig 10
 MODELS = {  # a row names the constants, from DATA to Z_RANGE, in which a model differs
-    "main": {}, "main_none": NONE, "full": dict(DATA="full"), "full_circle": dict(DATA="full", CIRCLE=True),
+    "main": {}, "main_none": NONE, "full": dict(DATA="full"), "four_factors": FOUR,
     "polar": POLAR, "polar_cartesian": POLAR | dict(LABELS="x y"),
     "polar_none": POLAR | NONE | dict(LABELS="x y"), "speed_acc": LINE, "speed_acc_none": LINE | NONE,
-    "four_factors": FOUR, "four_factors_circle": FOUR | dict(CIRCLE=True),
     # To be run with ten seeds: own axes and beta's warm-up, one of the two, neither, no labels.
     "seeds": {}, "seeds_own_axis": dict(BETA_WARM_UP=0), "seeds_warm_up": dict(OWN_AXIS=False),
-    "seeds_plain": PRINTED | dict(EPOCHS=24), "seeds_none": NONE,
+    "seeds_plain": PRINTED | dict(EPOCHS=24), "seeds_none": NONE, "beta_gamma": PRINTED,
 } | {f"beta_gamma_b{beta}_g{gamma}": PRINTED | dict(BETA=beta, GAMMA=gamma) for beta, gamma in WEIGHTS}
 FIGURES = {  # a column of a figure: title ("": the model's name), model, T of its traversals (0: of the data)
     "fig04_latent_traversals": [
@@ -63,40 +61,36 @@ FIGURES = {  # a column of a figure: title ("": the model's name), model, T of i
     "fig10_beta_gamma": [("", f"beta_gamma_b{beta}_g{gamma}", 0) for beta, gamma in WEIGHTS],
     "fig11_polar_cartesian": [("", "polar", 0), ("", "polar_cartesian", 0), ("", "polar_none", 0)],
     "fig12_speed_acceleration": [("", "speed_acc", 0), ("", "speed_acc_none", 0)],
-    "fig13_four_factors": [("", "four_factors", 0), ("", "four_factors_circle", 0)],
-    "full_circle_traversals": [("", "full", 0), ("", "full_circle", 0)],
+    "fig13_four_factors": [("", "four_factors", 0)],
 }
 
 
 class Encoder(nn.Module):
     """q_phi(z | tau, y), Fig 1: an LSTM reads a displacement and all labels at each step, and its last state
-    gives a Gaussian over z. circle: index of a latent that is an angle, or None."""
-    def __init__(self, x_dim, y_dim, z_dim, hidden, circle=None):
+    gives a Gaussian over z."""
+    def __init__(self, x_dim, y_dim, z_dim, hidden):
         super().__init__()
-        self.z_dim, self.circle = z_dim, circle
         self.cell = nn.LSTMCell(x_dim + y_dim, hidden)  # in short loops faster than nn.LSTM
-        outputs = 2 * z_dim + (circle is not None)  # one more for angle_mean
-        self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
+        self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2 * z_dim))
 
     def forward(self, x, y):
         """x (B, T, x_dim), y (B, y_dim) one-hot labels side by side -> mean, log-variance (B, z_dim) each."""
         state = None
         for displacement in x.unbind(1):
             state = self.cell(torch.cat([displacement, y], 1), state)  # labels at each step, App. A.1.2
-        out = self.head(state[0])
-        mean, log_var = out[:, :self.z_dim], out[:, self.z_dim:2 * self.z_dim]
-        return angle_mean(mean, out[:, -1], self.circle), log_var
+        return self.head(state[0]).chunk(2, 1)
 
 
 class LabelDecoders(nn.Module):
     """p_theta(y^m | z), the M label decoders of Fig 1: MLPs over all of z (the paper) or, with own_axis, the
     logits scale * z^m * order_k + bias_k of classes k, which then lie in their order along latent m."""
-    def __init__(self, labels, z_dim, hidden, circle, own_axis):
+    def __init__(self, labels, z_dim, hidden, own_axis):
         super().__init__()
-        self.circle, self.own_axis = circle, own_axis
+        self.own_axis = own_axis
         sizes = [common.CLASSES[name] for name in labels]
-        self.order = [class_order(name, sizes[m], m == circle) for m, name in enumerate(labels)]
-        if own_axis:
+        if own_axis:  # in order; zero curvature, the first class, lies between negative and positive
+            self.order = [torch.tensor([0.0, 1.0, -1.0]) if name in MULTI else torch.arange(float(size))
+                          for name, size in zip(labels, sizes)]
             self.scale = nn.Parameter(torch.full((len(labels),), 3.0))
             self.bias = nn.ParameterList(torch.zeros(size) for size in sizes)
         else:
@@ -107,44 +101,7 @@ class LabelDecoders(nn.Module):
         """z (B, z_dim) -> the logits of each label's classes: M tensors (B, classes)."""
         if not self.own_axis:
             return [head(z) for head in self.heads]
-        read = [on_circle(z[:, m]) if m == self.circle else z[:, [m]] for m in range(len(self.order))]
-        return [self.scale[m] * read[m] @ order + self.bias[m] for m, order in enumerate(self.order)]
-
-
-# -------- p(z), and what changes if a latent is an angle, of which 3 is a whole turn (CIRCLE, ours)
-
-def angle_mean(mean, last, circle):
-    """Means (B, z_dim) of the encoder, the angle as the direction of two outputs, its own and the last (B,).
-    The trap: a single output would have to jump where the circle closes."""
-    if circle is None:
-        return mean
-    angle = torch.atan2(last, mean[:, circle]) * 3 / (2 * math.pi)
-    return torch.cat([mean[:, :circle], angle[:, None], mean[:, circle + 1:]], 1)
-
-
-def class_order(name, classes, on_an_angle):
-    """Where the classes of a label lie along its latent, (1, classes). Zero lies between negative and
-    positive; on an angle each class is at its true direction, (2, classes): this fixes direction 0."""
-    if on_an_angle:
-        return on_circle(1.5 - 3 / classes * (torch.arange(0.0, classes) + 0.5)).T
-    return torch.tensor([[0.0, 1.0, -1.0]]) if name in MULTI else torch.arange(0.0, classes)[None]
-
-
-def prior(n, z_dim, circle):
-    """n samples of p(z), (n, z_dim), the same at each call: N(0, 1), an angle uniform over the turn."""
-    z = torch.randn(n, z_dim, generator=torch.Generator().manual_seed(0))
-    if circle is not None:
-        z[:, circle] = torch.linspace(-1.5, 1.5, n)
-    return z
-
-
-def divergence(mean, log_var, circle):
-    """D_KL(q(z | tau, y) || p(z)) of each latent, (B, z_dim); of an angle too small by at most 0.1, as q does
-    not wrap."""
-    kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var)
-    if circle is not None:
-        kl[:, circle] = torch.relu(math.log(3) - 0.5 * (math.log(2 * math.pi * math.e) + log_var[:, circle]))
-    return kl
+        return [self.scale[m] * z[:, [m]] * order + self.bias[m] for m, order in enumerate(self.order)]
 
 
 # -------- Eq. 3 and 4, and the first loop of Alg. 1 (the state decoder p_theta(tau | z) is common.Decoder)
@@ -163,7 +120,8 @@ def objective(encoder, decoder, label_decoders, x, one_hot, y):
     states = log_normal(x, *decoder.decode_latents(z, x.shape[1])).sum((1, 2)).mean()
     logits = label_decoders(z)
     labels = -sum(F.cross_entropy(logits[m], y[:, m]) for m in range(len(logits)))  # sum_m log p(y^m | z)
-    return states, labels, divergence(mean, log_var, decoder.circle).sum(1).mean()
+    kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1).mean()  # D_KL(q(z | tau, y) || N(0, I))
+    return states, labels, kl
 
 
 def supervision(dataset, hyper):
@@ -186,10 +144,9 @@ def train(x, one_hot, y, names, hyper):
     """Alg. 1, "WET-VAE training". x, one_hot, y: see supervision. names of the M factors. hyper: the model's
     hyperparameters, one for each constant from DATA to Z_RANGE. Returns encoder and decoder."""
     labels = names if hyper.labelled else []
-    circle = names.index("direction") if hyper.circle else None
-    encoder = Encoder(x.shape[2], one_hot.shape[1], len(names), hyper.hidden, circle)
-    decoder = Decoder(len(names), x.shape[2], hyper.hidden, circle)
-    label_decoders = LabelDecoders(labels, len(names), hyper.hidden, circle, hyper.own_axis)
+    encoder = Encoder(x.shape[2], one_hot.shape[1], len(names), hyper.hidden)
+    decoder = Decoder(len(names), x.shape[2], hyper.hidden)
+    label_decoders = LabelDecoders(labels, len(names), hyper.hidden, hyper.own_axis)
     networks = nn.ModuleList([encoder, decoder, label_decoders])
     optimizer = torch.optim.Adam(networks.parameters(), fused=True)
     updates = len(x) // hyper.batch  # of an epoch
@@ -219,7 +176,7 @@ def check_factors(decoder, names, steps):
     latents with factors by the largest total |correlation|. Sets decoder.axes, the signed permutation after
     which axis m of z is factor m and + is more of it. Returns the |correlations| (M,)."""
     n = len(names)
-    latents = prior(5000, n, decoder.circle)
+    latents = torch.randn(5000, n, generator=torch.Generator().manual_seed(0))  # z ~ p(z)
     found = list(factors_of(decoder.decode_latents(latents, steps)[0].double().numpy(), names).values())
     with np.errstate(invalid="ignore", divide="ignore"):  # a factor that never changes has no correlation
         corr = np.nan_to_num(np.corrcoef(latents.double().numpy().T, found)[:n, n:])  # latents x factors
@@ -275,8 +232,8 @@ def main():
             made = common.digest(datasets[hyper.data]["config"] | dict(SEED=0, OUT="", FIGURE=""))
             settings = constants | dict(DATASET=made)  # the same for all seeds
             example = []
-            if hyper.labelled and names == ["speed", "direction", "curvature"]:
-                example = follow_one_skill(encoder, decoder, ranges, steps, hyper)
+            if hyper.labelled and "example" in datasets[hyper.data]:
+                example = follow_one_skill(encoder, decoder, datasets[hyper.data], hyper)
             common.save(OUT, "wetvae", name, SEED, settings, settings=common.digest(common.made_by(settings)),
                         decoder=decoder, encoder=encoder.state_dict(), names=names, ranges=ranges,
                         relation=relation, length=steps, seconds=seconds, abs_corr=abs_corr, example=example)
@@ -312,10 +269,6 @@ def check(columns, models, datasets):
         if len(x) < hyper.batch:
             stop(f"{at}{len(x)} trajectories are fewer than --batch {hyper.batch}: lower it, or {make}")
         common.need_memory(160 * hyper.hidden ** 2, "--hidden")
-        angle = math.degrees(np.ptp(ranges.get("direction", [0, 0])))
-        if hyper.circle and not (angle > 359 and hyper.labelled and hyper.own_axis):
-            stop(f"{at}--circle true needs direction in --labels, from 360 degrees (here {angle:.0f}), "
-                 "--labelled true and --own_axis true, as in --experiment full_circle")
         for m, factor in enumerate(ranges if hyper.labelled else ()):
             counts = np.bincount(y[:, m], minlength=common.CLASSES[factor])
             mend = "take --data polar" if factor in ("x", "y") else f"make other data: {make}"
@@ -325,18 +278,14 @@ def check(columns, models, datasets):
 
 
 @torch.no_grad()
-def follow_one_skill(encoder, decoder, ranges, steps, hyper):
+def follow_one_skill(encoder, decoder, dataset, hyper):
     """Print what the model makes of the example that all four scripts follow. Returns its z."""
-    factors, t = np.array([[0.6, math.radians(20), math.radians(-10)]]), np.arange(steps)
-    heading = factors[:, 1:2] + factors[:, 2:] * t
-    points = np.pad(0.6 * np.stack([np.cos(heading), np.sin(heading)], 2).cumsum(1), ((0, 0), (1, 0), (0, 0)))
-    example = dict(trajectories=points.astype(np.float32), names=np.array(list(ranges)), factors=factors,
-                   ranges=np.array(list(ranges.values())))
-    x, one_hot, _, _ = supervision(example, hyper)
+    example = dataset | dict(trajectories=dataset["example"], factors=dataset["example_factors"])
+    x, one_hot, _, ranges = supervision(example, hyper)
     z = encoder(x, one_hot)[0] @ decoder.axes.T  # to the canonical axes: the inverse of Decoder.forward
     print("one skill, followed: speed 0.6, direction 20 degrees, curvature -10 degrees a transition")
     print("  encoded: z =", ", ".join(f"{name} {value:+.2f}" for name, value in zip(ranges, z[0])))
-    for text, rows in (("  its displacements:", x[0]), ("  decoded from z:   ", decoder(z, steps)[0][0])):
+    for text, rows in (("  its displacements:", x[0]), ("  decoded from z:   ", decoder(z, len(x[0]))[0][0])):
         print(text, *(f"({dx:.2f}, {dy:.2f})" for dx, dy in rows[:10]), " end:", rows.sum(0).numpy().round(2))
     return z[0].tolist()
 
@@ -355,7 +304,7 @@ def measure(name, model):
     decoder, names, values = model["decoder"], model["names"], np.linspace(-1.5, 1.5, 61)
     curves = [factors_of(traverse(decoder, i, values, model["length"]), names) for i in range(len(names))]
     (C, purity), rows = common.cross_talk(curves, model["ranges"]), []
-    groups = [group for group in (*MODELS, "beta_gamma") if name.startswith(group + "_")]
+    groups = [group for group in MODELS if name.startswith(group + "_")]
     group = max(groups, key=len, default=name)
     same = dict(experiment=group, seed=SEED, labels=name.removeprefix(group + "_"))
     for i, factor in enumerate(names):
@@ -364,8 +313,7 @@ def measure(name, model):
                    crosstalk=", ".join(f"{other} {c:.2f}" for other, c in zip(names, C[i])),
                    range_low=curve.min(), range_high=curve.max(), largest_gap_deg="")
         if factor == "direction" and np.ptp(model["ranges"][factor]) > 6.28:  # empty angles, App. A.3.1
-            reach = 3.0 if decoder.circle is None else 1.5  # where a circle closes
-            first = traverse(decoder, i, np.linspace(-reach, reach, 3001), 1)
+            first = traverse(decoder, i, np.linspace(-3, 3, 3001), 1)
             first = first[np.linalg.norm(first[:, 0], axis=1) > 0.1]
             if len(first):
                 covered = common.spread(factors_of(first, [factor])[factor], factor)

@@ -26,9 +26,7 @@ OUT: str = "runs"             # folder that everything is written to
 TRAIN: bool = True            # false: only measure and draw what is already trained
 RESUME: bool = False          # true: continue from the last checkpoint
 THREADS: Count = 2            # CPU threads; 1: updates wait for the robots' step, with the same result
-REPORTS: Count = 20           # printed lines, points of the learning curve, and checkpoints
 
-METHOD: str = "wedis"         # wedis, dads or sectar
 DECODER: str = "main"         # model of 02 whose decoder is the reward
 ROBOT: str = "ant"            # ant or half_cheetah
 STEP_SCALE: Positive = 0.1    # metres per trajectory unit, App. A.1.3: 1/10, Half-Cheetah 1/5
@@ -43,34 +41,29 @@ WARM_UP: Count = 10_000       # steps with random actions; their statistics norm
 REPLAY: Count = 1_000_000     # steps in the replay buffer R
 UPDATES_PER_STEP: Count = 8   # updates in each step of all robots
 BATCH: Count = 256            # App. A.1.3
-RELABELLED: Share = 0.5       # share of a batch that is relabelled with a fresh skill (the paper: 0)
 CORRECTED: Share = 0.25       # share of skills with a random correction, as in closed loop (the paper: 0)
 
 HIDDEN: Count = 256           # width of both hidden layers (the paper: 512; Half-Cheetah 256)
-LEARNING_RATE: Positive = 1e-3  # Adam (the paper: 0.0003, fixed)
-DECAY_FROM: Share = 0.5       # share of the updates after which it falls linearly to 0 (the paper: 1)
+LEARNING_RATE: Positive = 1e-3  # of Adam, falls linearly to 0 (the paper: 0.0003, fixed)
 ACTOR_EVERY: Count = 2        # updates of the critics for each of actor and value network (the paper: 1)
-AVERAGED: Share = 0.002       # rate of the average of the actor's weights that is the policy (the paper: 1)
 DISCOUNT: Share = 0.98        # gamma of Eq. 1 (the paper: 0.99): a shorter horizon teaches to follow sooner
 SMOOTHING: Share = 0.01       # of the target value network, App. A.1.3
 REWARD_SCALE: float = 0.1     # of Eq. 6 (the paper: 1)
 TEMPERATURE: float = 0.003    # alpha, weight of the entropy (the paper: 0.01; at our reward scale 0.001)
 FLOOR_START: float = 0.04     # metres, least standard deviation in the reward; if small, robots stand still
-FLOOR_END: float = 0.01       # the same when it has shrunk: this teaches slow skills (the paper: no floor, 0)
-FLOOR_FROM: Share = 0.15      # share of the updates after which the floor shrinks, geometrically
-FLOOR_UNTIL: Share = 0.6      # share of the updates at which it reaches FLOOR_END
+FLOOR_END: float = 0.01       # what it shrinks to, geometrically: slow skills are learnt (the paper: 0)
 
 # Baselines only
+METHOD: str = "wedis"         # wedis, or a baseline: dads or sectar
 Z_DIM: Count = 2              # entries of z: DADS 2, SeCTAR 8
 RECENT: Count = 40_000        # latest steps that a baseline's model learns from
 MODEL_BATCH: Count = 256      # steps (DADS), trajectories (SeCTAR) in a batch
 MODEL_UPDATES: Count = 4      # DADS: updates of the skill dynamics in each step of all robots
 PRIOR_SAMPLES: Count = 100    # L of DADS's reward
-EXPLORE: Share = 0.5          # SeCTAR: share of trajectories of the explorer (0: no explorer)
-EXPLORER: Positive = 3.0      # last entry of an explorer's z, and length of its commands
-KL_WEIGHT: float = 2.0        # SeCTAR: of the KL divergence in its ELBO
+RELABELLED: Share = 0.5       # DADS: share of a batch that is judged by a fresh skill
 
 # Measuring only: never an obstacle to --resume
+REPORTS: Count = 20           # printed lines, points of the learning curve, and checkpoints
 Z_RANGE: Positive = 1.5       # skills are measured for z from -Z_RANGE to Z_RANGE
 SINGLE_RUN: tuple[Count, Count] = (1, 100)  # T, H_z of the tracking error and Fig 5 for z_single, Sec. 6.1.2
 MULTI_RUN: tuple[Count, Count] = (5, 40)  # T, H_z of the following error, purity and Fig 5 for z_multi
@@ -79,19 +72,18 @@ NOISY: Count = 16             # noisy starts that are averaged for purity
 STARTS: Count = 400           # noisy starts of the following error
 FIGURE: str = ""              # name of the figure of skills ("": skills_<experiment>)
 
-SECTAR = dict(METHOD="sectar", UPDATES=66_000, Z_DIM=8, SKILL_STEPS=50, RECENT=512_000, MODEL_BATCH=128,
-              REWARD_SCALE=1.0, SINGLE_RUN=(50, 1), MULTI_RUN=(50, 1))  # as many minutes as WEDIS
 EXPERIMENTS = {  # a row names the constants in which an experiment differs
     "ant_semi": dict(FIGURE="fig05_skills_wedis"),
-    "ant_full": dict(DECODER="full_circle", FIGURE="fig15_full_circle"),
+    "ant_full": dict(DECODER="full", FIGURE="fig15_full_circle"),
     "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, BASE_FRAME=False,
                          VARIANCE_SCALE=0.05, ROBOTS=64, SKILL_STEPS=100, CORRECTED=0.5, DISCOUNT=0.97,
                          Z_RANGE=1.0, MULTI_RUN=(6, 20), FIGURE="fig16_half_cheetah"),
     "ant_world_frame": dict(BASE_FRAME=False),  # the paper's frame
-    "ant_dads": dict(METHOD="dads", Z_RANGE=1.0, SKILL_STEPS=200, REWARD_SCALE=1.0, DISCOUNT=0.995,
+    "ant_dads": dict(METHOD="dads", UPDATES=88_000, Z_RANGE=1.0, SKILL_STEPS=200, REWARD_SCALE=1.0, DISCOUNT=0.995,
                      MULTI_RUN=(1, 200), FIGURE="fig05_skills_dads"),
-    "ant_sectar": SECTAR | dict(FIGURE="fig05_skills_sectar"),
-    "ant_sectar_no_explorer": SECTAR | dict(EXPLORE=0.0),  # what the explorer is good for
+    "ant_sectar": dict(METHOD="sectar", UPDATES=80_000, Z_DIM=8, SKILL_STEPS=50, RECENT=512_000,
+                       MODEL_BATCH=128, REWARD_SCALE=1.0, SINGLE_RUN=(50, 1), MULTI_RUN=(50, 1),
+                       FIGURE="fig05_skills_sectar"),
 }
 MAY_DIFFER = (  # between a policy, or a checkpoint, and the run that uses it
     "OUT TRAIN RESUME THREADS REPORTS UPDATES Z_RANGE SINGLE_RUN MULTI_RUN TRAVERSAL NOISY STARTS FIGURE "
@@ -121,7 +113,7 @@ def train_wedis(decoder, names):
     Returns the policy. Shapes beside the lines: the Ant, n = ROBOTS, B = UPDATES_PER_STEP * BATCH = 2048."""
     x_dim, m1 = decoder.x_dim, sum(name in SINGLE for name in names)
     m2 = len(names) - m1
-    (robots, rng), worker = start_robots(), ThreadPoolExecutor(1)
+    robots, rng, submit = start_robots()
     s_dim, a_dim = robots.observe().shape[1], robots.ctrl.shape[1]
     sac = Sac(s_dim, x_dim, a_dim)
     replay = Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=x_dim, z_single=m1, correction=x_dim)
@@ -143,28 +135,24 @@ def train_wedis(decoder, names):
         a = sac.actor.act(s, command)                                                # (n, 8)
         if replay.added < WARM_UP:
             a = torch.rand(a.shape) * 2 - 1
-        physics = worker.submit(robots.step, a.numpy())
-        if THREADS == 1:
-            physics.result()
+        physics = submit(a)
 
         if replay.added >= WARM_UP:
             if sac.updates == 0:
                 sac.normalise(replay.read(slice(0, replay.added)).s)
-            # Alg. 1: sample a batch of transitions. Relabelling: any step can be judged by any skill
+            # Alg. 1: sample a batch of transitions
             batch = replay.sample(UPDATES_PER_STEP * BATCH)                          # (B, ..) each
-            fresh = torch.rand(len(batch.s), 1) < RELABELLED                         # (B, 1)
-            batch.correction = torch.where(fresh, random_corrections(len(fresh), x_dim), batch.correction)
-            batch.z_single = torch.where(fresh, torch.randn(len(fresh), m1), batch.z_single)
-            z = torch.cat([batch.z_single, torch.zeros(len(fresh), m2)], 1)          # (B, 3)
+            z = torch.cat([batch.z_single, torch.zeros(len(batch.s), m2)], 1)        # (B, 3)
 
             # Alg. 1: compute the reward r = log p_theta(s_t+1 | s_t, z), Eq. 6
             mean, log_var = (out[:, 0] for out in decoder(z, 1))                     # (B, 2) each
-            floor = floor_at(sac.updates / UPDATES)
-            r = reward(mean + batch.correction, log_var, batch.displacement, floor)  # (B,)
+            floor = FLOOR_START ** (1 - sac.updates / UPDATES) * FLOOR_END ** (sac.updates / UPDATES)
+            c = mean + batch.correction                                              # (B, 2)
+            r = reward(c, log_var, batch.displacement, floor)                        # (B,)
             on_floor = (VARIANCE_SCALE * log_var.exp() < floor ** 2).float().mean()
 
             # Alg. 1: optimize psi and the critics with the SAC, BATCH steps at a time
-            losses = sac.learn(batch, mean + batch.correction, mean + batch.correction, r)
+            losses = sac.learn(batch, c, c, r)
             log.numbers = losses | dict(reward=r.mean(), on_floor=on_floor)
 
         # Alg. 1: collect the samples in the replay buffer R
@@ -176,17 +164,10 @@ def train_wedis(decoder, names):
     return log.policy
 
 
-def floor_at(progress):
-    """The least standard deviation in the reward, metres, when a share `progress` of the training is done."""
-    shrunk = min(1, max(0, (progress - FLOOR_FROM) / max(FLOOR_UNTIL - FLOOR_FROM, 1e-9)))
-    return FLOOR_START * (FLOOR_END / max(FLOOR_START, 1e-9)) ** shrunk
-
-
 # -------- SAC (Haarnoja et al. 2017), App. A.1.3
 
 class Sac(nn.Module):
-    """Actor psi, twin critics, value and target network, with a fixed temperature. average: the policy,
-    a running average of the actor's weights."""
+    """Actor psi, twin critics, value and target network, with a fixed temperature."""
 
     def __init__(self, s_dim, c_dim, a_dim):
         super().__init__()
@@ -195,7 +176,6 @@ class Sac(nn.Module):
         self.critics = nn.ModuleList(layers(n_in + a_dim, HIDDEN, 1) for _ in range(2))
         self.value = layers(n_in, HIDDEN, 1)
         self.target = copy.deepcopy(self.value).requires_grad_(False)
-        self.average = copy.deepcopy(self.actor).requires_grad_(False)
         self.critic_adam = torch.optim.Adam(self.critics.parameters(), fused=True)
         self.actor_adam = torch.optim.Adam([*self.actor.parameters(), *self.value.parameters()], fused=True)
         self.updates, self.losses = 0, {}
@@ -204,15 +184,13 @@ class Sac(nn.Module):
         """Fix the mean and deviation of the state, from random steps s (N, s_dim)."""
         x = self.actor.inputs(s, torch.zeros(len(s), self.actor.arguments[1]))[:, :len(self.actor.s_mean)]
         self.actor.s_mean.copy_(x.mean(0))
-        self.actor.s_std.copy_(x.std(0).clamp(min=1e-3))
-        self.average.load_state_dict(self.actor.state_dict())
+        self.actor.s_std.copy_(x.std(0, correction=0).clamp(min=1e-3))
 
     def learn(self, batch, c, c2, r):
         """Updates with the steps of batch, BATCH at a time. c, c2 (B, c_dim): commands before and after the
         step; r (B,): rewards. Returns the last losses."""
-        left = (1 - self.updates / UPDATES) / max(1 - DECAY_FROM, 1e-9)
         for group in self.critic_adam.param_groups + self.actor_adam.param_groups:
-            group["lr"] = LEARNING_RATE * min(1, left)
+            group["lr"] = LEARNING_RATE * (1 - self.updates / UPDATES)
         x, x2 = self.actor.inputs(batch.s, c), self.actor.inputs(batch.s2, c2)
         for part in zip(x.split(BATCH), batch.a.split(BATCH), x2.split(BATCH), r.split(BATCH)):
             self.update(*part)
@@ -244,8 +222,6 @@ class Sac(nn.Module):
         self.actor_adam.step()
         with torch.no_grad():
             torch._foreach_lerp_([*self.target.parameters()], [*self.value.parameters()], SMOOTHING)
-            rate = AVERAGED or 1.0  # 0 switches the average off
-            torch._foreach_lerp_([*self.average.net.parameters()], [*self.actor.net.parameters()], rate)
         self.losses |= dict(actor_loss=actor_loss.detach())
 
 
@@ -279,22 +255,18 @@ def check(source):
         stop("--method is wedis, dads or sectar; --robot is ant or half_cheetah")
     if ROBOT != "ant" and (BASE_FRAME or METHOD != "wedis"):
         stop(f"the {ROBOT} runs on a rail: --base_frame false; DADS and SeCTAR need --robot ant")
-    if METHOD == "sectar" and Z_DIM < 3 or METHOD == "dads" and BASE_FRAME and Z_DIM != 2:
-        stop("SeCTAR needs --z_dim 3 or more; DADS --z_dim 2, or --base_frame false")
+    if METHOD == "dads" and BASE_FRAME and Z_DIM != 2:
+        stop("in the base frame, in which z is turned, DADS needs --z_dim 2")
     known = names[0] == "speed" and all(name in SINGLE or MULTI.get(name) in names for name in names)
     if not known or decoder.x_dim != 1 + (ROBOT == "ant"):
         stop(f"the decoder {DECODER} has axes {' '.join(names)} and predicts {decoder.x_dim} coordinates: "
              f"the {ROBOT} needs another --decoder")
-    if weak := [name for name, corr in zip(names, source["abs_corr"]) if corr < 0.5]:
-        print(f"the decoder {DECODER} has no latent that means {' or '.join(weak)}")
     if DISCOUNT == 1:
         stop("--discount must be below 1: no step is terminal, so values would have no bound")
-    if EPISODE % SKILL_STEPS:
-        stop(f"--skill_steps must divide --episode, {EPISODE}")
+    if METHOD == "sectar" and EPISODE % SKILL_STEPS:
+        stop(f"SeCTAR: --skill_steps must divide --episode, {EPISODE}")
     if METHOD == "dads" and SINGLE_RUN[0] * MULTI_RUN[0] > 1:
         stop("DADS predicts one step: T, the first of --single_run and --multi_run, must be 1")
-    if ROBOTS * WARM_UP == 1:
-        stop("--warm_up must be at least 2: the deviation of the state needs two steps")
     steps = max(REPLAY, 2 * ROBOTS * SKILL_STEPS)
     common.need_memory(300 * steps + 50_000 * ROBOTS, "--replay or --robots")  # bytes of a step, of a robot
 
@@ -315,19 +287,27 @@ def same_decoder(policy, decoder):
 
 def start_robots():
     """ROBOTS robots near the origin, each at another moment of its episode, so that skills change at all
-    times; and the generator of their starts."""
+    times; the generator of their starts; and what submits their next step to the second core."""
     robots, rng = common.Robots(common.robot_spec(ROBOT), ROBOTS), np.random.default_rng(SEED)
     robots.reset(np.arange(ROBOTS), rng)
     age = rng.integers(0, EPISODE, ROBOTS)
     if METHOD == "sectar":
         age -= age % SKILL_STEPS  # together: trajectories are rows of the replay buffer
     robots.time[:] = age * robots.step_seconds
-    return robots, rng
+    worker = ThreadPoolExecutor(1)
+
+    def submit(action):
+        physics = worker.submit(robots.step, action.numpy())
+        if THREADS == 1:
+            physics.result()
+        return physics
+
+    return robots, rng, submit
 
 
 def make_policy(sac, decoder, names, scale):
     """What 04 needs of a policy, and what the reports measure."""
-    return SimpleNamespace(actor=sac.average, decoder=decoder, names=names, scale=scale, method=METHOD,
+    return SimpleNamespace(actor=sac.actor, decoder=decoder, names=names, scale=scale, method=METHOD,
                            robot=ROBOT, relation={}, updates=0, env_steps=0, seconds=0.0, curve=[])
 
 
@@ -356,6 +336,15 @@ class Replay:
         """The last n steps, of all robots; at the start zeros."""
         n = min(n, max(self.added, ROBOTS), len(self.table))
         return self.read((self.added - n + torch.arange(n)) % len(self.table))
+
+    def trajectories(self, n, recent):
+        """n random whole skills of the `recent` latest steps, for SeCTAR, whose robots begin them together:
+        fields (n, SKILL_STEPS, width)."""
+        block = ROBOTS * SKILL_STEPS
+        done, blocks = self.added // block, len(self.table) // block
+        back = torch.randint(max(1, min(done, blocks - 1, recent // block)), (n,))
+        first = (done - 1 - back) % blocks * block + torch.randint(ROBOTS, (n,))
+        return self.read(first[:, None] + ROBOTS * torch.arange(SKILL_STEPS))
 
     def sample(self, n, recent=None):
         """n random steps, of all or of the `recent` latest ones."""
@@ -427,28 +416,22 @@ def train_dads(_decoder, _names):
     skill dynamics q(displacement | z), learnt at the same time: a Gaussian (theirs: a mixture of four) of
     deviation 1 in units of the root mean square of recent displacements, as in their code: a learnt deviation
     rewards standing still. In the base frame z is turned as if it were a displacement."""
-    robots, rng = start_robots()
-    worker, s_dim, a_dim = ThreadPoolExecutor(1), robots.observe().shape[1], robots.ctrl.shape[1]
+    robots, rng, submit = start_robots()
+    s_dim, a_dim = robots.observe().shape[1], robots.ctrl.shape[1]
     sac, replay = Sac(s_dim, Z_DIM, a_dim), Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=2, z=Z_DIM)
     dynamics = Decoder(Z_DIM, 2, 64)
     adam = torch.optim.Adam(dynamics.parameters(), lr=LEARNING_RATE, fused=True)
     log = Log(make_policy(sac, dynamics, [], STEP_SCALE), robots, rng, replay, sac, dynamics, adam)
     z = replay.latest(ROBOTS).z
 
-    def log_q(displacement, z):
-        """log q up to a constant: displacement (B, 2), own z (B, 2) -> (B,); (B, 1, 2), (L, 2) -> (B, L)."""
-        mean = dynamics(z, 1)[0][:, 0]
-        return -0.5 * ((displacement / log.policy.scale - mean) ** 2).sum(-1)
+    def log_q(displacement, z):  # up to a constant; (B, 2), own z (B, 2) -> (B,); (B, 1, 2), (L, 2) -> (B, L)
+        return -0.5 * ((displacement / log.policy.scale - dynamics(z, 1)[0][:, 0]) ** 2).sum(-1)
 
     while sac.updates < UPDATES:
-        over = robots.age() % SKILL_STEPS == 0
-        z = torch.where(over, torch.rand(ROBOTS, Z_DIM) * 2 - 1, z)
+        z = torch.where(robots.age() % SKILL_STEPS == 0, torch.rand(ROBOTS, Z_DIM) * 2 - 1, z)
         s = robots.observe()
         a = sac.actor.act(s, z) if replay.added >= WARM_UP else torch.rand(ROBOTS, a_dim) * 2 - 1
-        physics = worker.submit(robots.step, a.numpy())
-        if THREADS == 1:
-            physics.result()
-
+        physics = submit(a)
         if replay.added >= WARM_UP:
             if sac.updates == 0:
                 sac.normalise(replay.read(slice(0, replay.added)).s)
@@ -460,7 +443,6 @@ def train_dads(_decoder, _names):
                 adam.zero_grad()
                 model_loss.backward()
                 adam.step()
-
             batch = replay.sample(UPDATES_PER_STEP * BATCH)
             fresh = torch.rand(len(batch.z), 1) < RELABELLED
             batch.z = torch.where(fresh, torch.rand(batch.z.shape) * 2 - 1, batch.z)
@@ -471,7 +453,6 @@ def train_dads(_decoder, _names):
                 r = REWARD_SCALE * (math.log(PRIOR_SAMPLES + 1) - (1 + ratios).log())
             losses = sac.learn(batch, batch.z, batch.z, r)
             log.numbers = losses | dict(reward=r.mean(), model_loss=model_loss.detach())
-
         displacement, unstable = physics.result()
         replay.add(unstable, s=s, a=a, s2=robots.observe(), displacement=displacement, z=z)
         robots.reset(np.flatnonzero((robots.age()[:, 0].numpy() >= EPISODE) | unstable), rng)
@@ -480,89 +461,56 @@ def train_dads(_decoder, _names):
 
 
 def train_sectar(_decoder, _names):
-    """Co-Reyes et al. 2018: skills z ~ N(0, I); a VAE learns from the trajectories of an explorer, the same
-    policy with very long commands. Reward: of a skill, minus the distance between its end and the decoder's;
-    of the explorer, how much farther along its command it ends than the VAE's reconstruction."""
-    robots, rng = start_robots()
-    worker, s_dim, a_dim = ThreadPoolExecutor(1), robots.observe().shape[1], robots.ctrl.shape[1]
+    """Co-Reyes et al. 2018, in short: skills z ~ N(0, I) of T = SKILL_STEPS steps; a VAE learns from the
+    policy's own trajectories (theirs: an explorer's, whose actions it clones), and the policy is rewarded for
+    ending where the decoder ends. Not reproduced: its skills are not followed."""
+    robots, rng, submit = start_robots()
+    s_dim, a_dim = robots.observe().shape[1], robots.ctrl.shape[1]
     sac, replay = Sac(s_dim, 2, a_dim), Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=2, z=Z_DIM)
     vae = nn.ModuleDict(dict(decoder=Decoder(Z_DIM, 2, 64), encoder=layers(2 * SKILL_STEPS, 64, 2 * Z_DIM)))
     adam = torch.optim.Adam(vae.parameters(), lr=LEARNING_RATE, fused=True)
     log = Log(make_policy(sac, vae["decoder"], [], STEP_SCALE), robots, rng, replay, sac, vae, adam)
     z = replay.latest(ROBOTS).z
 
-    def elbo(x):
-        """x (B, T, 2), trajectory units -> sum_t log p(x_t | z), KL(q || p), (B,), and means (B, T, 2)."""
-        mean, log_var = vae["encoder"](x.flatten(1)).chunk(2, 1)  # theirs: a bidirectional LSTM
-        kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1)
-        sampled = mean + (0.5 * log_var).exp() * torch.randn_like(mean)
-        decoded, variance = vae["decoder"](sampled, SKILL_STEPS)
-        variance = variance.exp().clamp(min=(0.01 / STEP_SCALE) ** 2)  # 1 cm, or likelihoods have no bound
-        return -0.5 * (variance.log() + (x - decoded) ** 2 / variance).sum((1, 2)), kl, decoded
-
-    def trajectories(n, recent):
-        """n random whole trajectories of the `recent` latest steps: fields (n, T, width)."""
-        block = ROBOTS * SKILL_STEPS
-        done, blocks = replay.added // block, len(replay.table) // block
-        back = torch.randint(max(1, min(done, blocks - 1, recent // block)), (n,))
-        first = (done - 1 - back) % blocks * block + torch.randint(ROBOTS, (n,))
-        return replay.read(first[:, None] + ROBOTS * torch.arange(SKILL_STEPS))
-
-    def commands(z, decoded):
-        """Commands (B, T, 2) of skills and explorers alike."""
-        return torch.where(z[:, None, -1:] == EXPLORER, z[:, None, :2].expand_as(decoded), decoded)
-
     while sac.updates < UPDATES:
-        over = torch.tensor(replay.added // ROBOTS % SKILL_STEPS == 0)  # all together
-        explorer = torch.rand(ROBOTS, 1) < EXPLORE
-        along = EXPLORER * nn.functional.normalize(torch.randn(ROBOTS, 2))
-        new = torch.randn(ROBOTS, Z_DIM)
-        marked = torch.cat([along, new[:, 2:-1], torch.full((ROBOTS, 1), EXPLORER)], 1)
-        new = torch.where(explorer, marked, new)
-        z = torch.where(over, new, z)
+        t = replay.added // ROBOTS % SKILL_STEPS  # of all robots: trajectories are rows of the replay buffer
+        z = torch.randn(ROBOTS, Z_DIM) if t == 0 else z
         with torch.no_grad():
-            command = commands(z, vae["decoder"](z, SKILL_STEPS)[0])[:, replay.added // ROBOTS % SKILL_STEPS]
+            command = vae["decoder"](z, SKILL_STEPS)[0][:, t]
         s = robots.observe()
         a = sac.actor.act(s, command) if replay.added >= WARM_UP else torch.rand(ROBOTS, a_dim) * 2 - 1
-        physics = worker.submit(robots.step, a.numpy())
-        if THREADS == 1:
-            physics.result()
-
+        physics = submit(a)
         if replay.added >= max(WARM_UP, ROBOTS * SKILL_STEPS):
             if sac.updates == 0:
                 sac.normalise(replay.read(slice(0, replay.added)).s)
-            batch = trajectories(MODEL_BATCH, RECENT)
-            used = (batch.z[:, 0, -1] == EXPLORER) | (EXPLORE == 0)
-            log_p, kl, _ = elbo(batch.displacement / STEP_SCALE)
-            model_loss = ((KL_WEIGHT * kl - log_p) * used).sum() / used.sum().clamp(min=1)
+            x = replay.trajectories(MODEL_BATCH, RECENT).displacement / STEP_SCALE
+            mean, log_var = vae["encoder"](x.flatten(1)).chunk(2, 1)  # theirs: a bidirectional LSTM
+            kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1)
+            sampled = mean + (0.5 * log_var).exp() * torch.randn_like(mean)
+            decoded, variance = vae["decoder"](sampled, SKILL_STEPS)
+            variance = variance.exp().clamp(min=(0.01 / STEP_SCALE) ** 2)  # 1 cm: a likelihood has no bound
+            log_p = -0.5 * (variance.log() + (x - decoded) ** 2 / variance).sum((1, 2))
+            model_loss = (kl - log_p).mean()
             adam.zero_grad()
             model_loss.backward()
             adam.step()
-
-            n = max(1, UPDATES_PER_STEP * BATCH // SKILL_STEPS)
-            batch = trajectories(n, len(replay.table))
-            x, new = batch.displacement / STEP_SCALE, batch.z[:, 0]
-            explorer = new[:, -1:] == EXPLORER
-            fresh = (torch.rand(n, 1) < RELABELLED) & ~explorer
-            new = torch.where(fresh, torch.randn(n, Z_DIM), new)
+            batch = replay.trajectories(max(1, UPDATES_PER_STEP * BATCH // SKILL_STEPS), REPLAY)
             with torch.no_grad():
-                decoded = torch.where(explorer[..., None], elbo(x)[2], vae["decoder"](new, SKILL_STEPS)[0])
+                c = vae["decoder"](batch.z[:, 0], SKILL_STEPS)[0]
             # Laplace likelihood of the end. The trap: that of steps is highest for standing still
-            error = x - decoded
-            direction = torch.where(explorer, new[:, :2], -error.sum(1))
-            r = REWARD_SCALE * (error * nn.functional.normalize(direction)[:, None]).sum(2)
-            c = commands(new, decoded)
+            error = batch.displacement / STEP_SCALE - c
+            r = -REWARD_SCALE * (error * nn.functional.normalize(error.sum(1))[:, None]).sum(2)
             c2 = torch.cat([c[:, 1:], c[:, -1:]], 1)
             order = torch.randperm(r.numel())
             flat = SimpleNamespace(**{name: part.flatten(0, 1)[order] for name, part in vars(batch).items()})
             losses = sac.learn(flat, c.flatten(0, 1)[order], c2.flatten(0, 1)[order], r.flatten()[order])
             log.numbers = losses | dict(reward=r.mean(), model_loss=model_loss.detach())
-
         displacement, unstable = physics.result()
         replay.add(unstable, s=s, a=a, s2=robots.observe(), displacement=displacement, z=z)
         robots.reset(np.flatnonzero((robots.age()[:, 0].numpy() >= EPISODE) | unstable), rng)
         log.step()
     return log.policy
+
 
 # -------- measuring and drawing
 
@@ -583,16 +531,14 @@ def traversal(policy, axis, values):
 
 
 def grid(policy):
-    """Skills of the tracking error, z_multi = 0: 5 speeds x 5 directions (full circle: 16; rail: 8 speeds);
-    SeCTAR: 25 draws from the prior."""
+    """Skills of the tracking error, z_multi = 0: 5 speeds x 5 directions (rail: 8 speeds); SeCTAR: 25 draws
+    from the prior."""
     if METHOD == "sectar":
         return torch.randn(25, Z_DIM, generator=torch.Generator().manual_seed(0))
     z = torch.linspace(-Z_RANGE, Z_RANGE, 8)[:, None]
     if policy.decoder.x_dim == 2:
-        speeds = directions = torch.linspace(-Z_RANGE, Z_RANGE, 5)
-        if policy.decoder.circle is not None:
-            directions = torch.linspace(-Z_RANGE, Z_RANGE, 17)[:-1]  # the two ends are one direction
-        z = torch.cartesian_prod(speeds, directions)
+        values = torch.linspace(-Z_RANGE, Z_RANGE, 5)
+        z = torch.cartesian_prod(values, values)
     return nn.functional.pad(z, (0, (len(policy.names) or Z_DIM) - z.shape[1]))
 
 
@@ -699,8 +645,7 @@ def follow_one_skill(policy, source):
 
 
 def draw_skills(policy):
-    """Fig 5, 15, 16: predicted and executed skills, a column per axis. On a rail the latent is on the y axis,
-    and transitions have colours."""
+    """Fig 5, 15, 16: predicted and executed skills, a column per axis. On a rail y is the latent."""
     names = policy.names or [str(i + 1) for i in range(Z_DIM)]
     rows = ("predicted", "executed, open loop", "executed, closed loop")[:2 + bool(policy.names)]
     rail = policy.decoder.x_dim == 1
@@ -708,20 +653,15 @@ def draw_skills(policy):
                                 figsize=(2.8 * len(names) + 1, 2.8 * len(rows)))
     for i, name in enumerate(names):
         run = MULTI_RUN if rail or name in MULTI else SINGLE_RUN
-        values = np.linspace(-1, 1, 9 if rail else 5)
+        values = np.linspace(-1, 1, 5)
         colours = ["#D55E00", "#009E73", "#0072B2", "#56B4E9", "#F0E442"]  # as the paper's
-        if name == "direction" and policy.decoder.circle is not None:
-            values = np.linspace(-1.5, 1.5, 17)[:-1]
-            colours = plt.get_cmap("twilight")(np.linspace(0.1, 0.9, len(values)))
         z = traversal(policy, i, values)
         paths = [predicted_path(policy, z, run)]
         paths += [roll_out(policy, z, run, closed) for closed in (False, True)[:len(rows) - 1]]
         for ax, path in zip(axes[:, i], paths):
-            marks = path[:, ::1 if path is paths[0] else run[1]]
             if rail:
-                for t, colour in enumerate(plt.get_cmap("plasma")(np.linspace(0, 0.85, marks.shape[1]))):
-                    ax.plot(marks[:, t, 0], values, ".", color=colour, label=f"t = {t}")
-                continue
+                path = np.dstack([path[..., 0], values[:, None] + 0 * path[..., 0]])
+            marks = path[:, ::1 if path.shape[1] == run[0] + 1 else run[1]]  # the ends of the transitions
             for line, dots, value, colour in zip(path, marks, values, colours):
                 ax.plot(*line.T, color=colour, lw=1.3, label=f"{value:g}")
                 ax.plot(*dots.T, "o", ms=3 if len(dots) < 10 else 0, color=colour)
@@ -732,7 +672,7 @@ def draw_skills(policy):
     for ax, text in zip(axes[:, 0], rows):
         ax.set_ylabel(f"{text}\n{'latent' if rail else 'y (m)'}")
     handles = axes[0, 0].get_legend_handles_labels()
-    figure.legend(*handles, title="transition" if rail else "latent", loc="outside right upper")
+    figure.legend(*handles, title="latent", loc="outside right upper")
     common.save_figure(figure, OUT, FIGURE or f"skills_{EXPERIMENT}")
 
 

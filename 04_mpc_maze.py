@@ -6,10 +6,9 @@ Expect, mean final distance of 3 policies x 50 trials (dense maze 1, 2; sparse m
 9.4 m as printed; 1.1, 2.1, 4.2, 4.5 m planned with commands; 0.2, 1.0, 3.8, 3.6 m in closed loop. The start
 is 26.8 m from the goal, and the shortest path around the walls is 36.4 m long.
 """
-import io
 import time
 from dataclasses import asdict, dataclass
-from functools import cache, partial
+from functools import partial
 from itertools import cycle, product
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +18,6 @@ from common import BLUE, GREY, RED, Count, Signed, commands_of, convert, execute
 import mujoco
 import numpy as np
 import torch
-from PIL import Image, ImageDraw  # comes with matplotlib
 
 EXPERIMENT: str = "mazes"  # row of EXPERIMENTS below
 SEED: int = 0             # random seed of the trials
@@ -204,8 +202,7 @@ def main():
     print(f"wrote {table}; mean distance to the goal at the end, share of trials nearer than EPSILON:")
     print_table(rows)
     for name in DRAW.split():
-        if name not in NEED_GL or can_render():
-            DRAWINGS[name](rows, configurations, examples)
+        DRAWINGS[name](rows, configurations, examples)
 
 
 @dataclass(frozen=True)
@@ -409,16 +406,16 @@ def draw_maze(ax, c, text, marker):
 
 
 def draw_fig03(rows, configurations, examples):
-    """Fig 3: trajectory scaling, on each mode's first plan: the same shape, H_z times as large; executed."""
-    firsts = {c.mode: (c, poses, paths[0]) for c, poses, paths in examples[::-1]}
-    figure, axes = plt.subplots(2, len(firsts), figsize=(4 * len(firsts), 5), squeeze=False)
-    for column, (mode, (c, poses, path)) in zip(axes.T, reversed(firsts.items())):
-        for ax, scale, text in zip(column, (1 / c.hold, 1), ("predicted", f"scaled by $H_z$ = {c.hold}")):
-            for first in range(0, len(path) - 1, c.length):
-                ax.plot(*((path[first:first + c.length + 1] - path[0]) * scale).T, ".-")
-            ax.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"{mode}: {text}")
-        column[1].plot(*(poses[:c.hold * c.length + 1, :2] - path[0]).T, "k", lw=1, label="executed")
-        column[1].legend()
+    """Fig 3: trajectory scaling, on the first plan: the same shape, H_z times as large, and executed."""
+    c, poses, paths = examples[0]
+    path = paths[0] - paths[0][0]
+    figure, axes = plt.subplots(1, 2, figsize=(8, 3.2))
+    for ax, scale, text in zip(axes, (1 / c.hold, 1), ("predicted", f"scaled by $H_z$ = {c.hold}")):
+        for first in range(0, len(path) - 1, c.length):
+            ax.plot(*(path[first:first + c.length + 1] * scale).T, ".-")
+        ax.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"{c.mode}: {text}")
+    axes[1].plot(*(poses[:c.hold * c.length + 1, :2] - poses[0, :2]).T, "k", lw=1, label="executed")
+    axes[1].legend()
     common.save_figure(figure, OUT, "fig03_trajectory_scaling")
 
 
@@ -432,33 +429,26 @@ def draw_fig06(rows, configurations, examples):
 
 
 def draw_fig07(rows, configurations, examples):
-    """Fig 7: mean final distance against N, its 95 % interval over policies and trials; thin: each policy;
-    dashed grey: the goal's distance from the start."""
-    panels, rng = dict.fromkeys((c.maze, c.reward, c.goal) for c in configurations), np.random.default_rng(0)
-    curves = dict.fromkeys((c.method, c.mode) for c in configurations)
-    sizes = sorted({c.samples for c in configurations})
+    """Fig 7: mean final distance against N, with its 95 % interval over policies and trials."""
+    panels = dict.fromkeys((c.maze, c.reward) for c in configurations)
     okabe_ito = cycle([BLUE, RED, "#009E73", "#E69F00", "#CC79A7", "#56B4E9"])
     colours = dict(zip(dict.fromkeys(c.method for c in configurations), okabe_ito))
-    marks = dict(printed="o-", commands="s--", closed="^:")
+    marks, rng = dict(printed="o-", commands="s--", closed="^:"), np.random.default_rng(0)
     figure, axes = plt.subplots(1, len(panels), figsize=(3.6 * len(panels), 4), sharey=True, squeeze=False)
-    for ax, (maze, reward, goal) in zip(axes[0], panels):
-        for method, mode in curves:
-            where, colour = dict(maze=maze, reward=reward, method=method, mode=mode), colours[method]
-            found = {n: values_of(rows, "final_distance", samples=n, **where) for n in sizes}
-            found = {n: values for n, values in found.items() if values.size}
-            if not found:
-                continue  # a row of METHODS may plan for one reward only
-            means = [values.mean(1) for values in found.values()]
-            resampled = [resampled_means(values, rng) for values in found.values()]
-            ax.fill_between(list(found), *np.quantile(resampled, [0.025, 0.975], 1), color=colour, alpha=0.12)
-            ax.plot(list(found), means, color=colour, lw=0.5, alpha=0.5)
-            ax.plot(list(found), np.mean(means, 1), marks[mode], color=colour, ms=4,
-                    label=f"{method}, {mode}")
-        ax.axhline(np.linalg.norm(goal), ls="--", color=GREY)
+    for ax, (maze, reward) in zip(axes[0], panels):
+        for method, mode in dict.fromkeys((c.method, c.mode) for c in configurations):
+            found, where = {}, dict(maze=maze, reward=reward, method=method, mode=mode)
+            for samples in sorted({c.samples for c in configurations}):
+                values = values_of(rows, "final_distance", samples=samples, **where)
+                if values.size:
+                    interval = np.quantile(resampled_means(values, rng), [0.025, 0.975])
+                    found[samples] = values.mean(), *interval
+            mean, low, high = np.array(list(found.values())).reshape(-1, 3).T
+            ax.fill_between(list(found), low, high, color=colours[method], alpha=0.12)
+            ax.plot(list(found), mean, marks[mode], color=colours[method], ms=4, label=f"{method}, {mode}")
         ax.set(xscale="log", xlabel="N, samples per plan", title=f"{maze}, {reward} reward")
     axes[0, 0].set(ylim=(0, None), ylabel="final distance (m)")
-    labels = {label: line for ax in axes[0] for line, label in zip(*ax.get_legend_handles_labels())}
-    figure.legend(labels.values(), labels, loc="outside lower center", ncols=5)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
     common.save_figure(figure, OUT, "fig07_planning")
 
 
@@ -485,67 +475,17 @@ def draw_examples(name, reward, rows, configurations, examples):
     common.save_figure(figure, OUT, name)
 
 
-@cache  # the trap: where a first try fails, a second one ends the process
-def can_render():
-    """Whether MuJoCo can draw off-screen. If not, says so once."""
-    try:
-        mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
-    except Exception:  # its kind differs by platform
-        print("no Fig 14, no GIF: MuJoCo's renderer finds no GL library (install EGL or OSMesa)")
-        return False
-    return True
+def rendered(rows, configurations, examples, name):
+    """Fig 14, the robots, and a GIF per maze: pictures of MuJoCo's renderer."""
+    from extras import render
+    render.draw(name, maze_spec, examples, OUT)
 
 
-def render(model, poses, height, width):
-    """Pictures (height, width, 3) of a model in poses (n, nq)."""
-    renderer, data, pictures = mujoco.Renderer(model, height, width), mujoco.MjData(model), []
-    for pose in poses:
-        data.qpos[:] = pose
-        mujoco.mj_forward(model, data)
-        renderer.update_scene(data)
-        pictures.append(renderer.render())
-    renderer.close()
-    return pictures
-
-
-def draw_fig14(rows, configurations, examples):
-    """Fig 14: both robots."""
-    figure, axes = plt.subplots(1, 2, figsize=(8, 3.2))
-    for ax, name in zip(axes, ("ant", "half_cheetah")):
-        model = common.robot_spec(name).compile()
-        model.stat.extent = 2.2  # metres, what the default camera shows
-        model.vis.map.shadowclip = 2  # or the floor is speckled
-        ax.imshow(*render(model, model.key_qpos[:1], 400, 500))
-        ax.set(title=name, xticks=[], yticks=[])
-        ax.grid(False)
-    common.save_figure(figure, OUT, "fig14_robots")
-
-
-def draw_gif(rows, configurations, examples):
-    """A GIF per maze: the last example with the first reward, so in the last mode."""
-    last = {c.maze: (c, poses) for c, poses, _ in examples if c.reward == examples[0][0].reward}
-    for maze, (c, poses) in last.items():
-        spec = maze_spec(c)
-        for x, y in poses[::10, :2]:
-            spec.worldbody.add_site(pos=[x, y, 0], size=[0.15, 0.15, 0.15], rgba=[0, 0.45, 0.7, 1])
-        model = spec.compile()
-        model.vis.global_.azimuth, model.vis.global_.elevation = 90, -65
-        model.stat.extent *= 0.37  # the walls fill the picture
-        pictures = [Image.fromarray(picture) for picture in render(model, poses[::8], 320, 480)]
-        for picture in pictures:
-            ImageDraw.Draw(picture).text((10, 6), f"{c.method}, {c.mode}", "black", font_size=18)
-        palette = pictures[0].quantize(48, Image.Quantize.MAXCOVERAGE)  # one for all, or colours flicker
-        frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
-        buffer = io.BytesIO()
-        frames[0].save(buffer, "GIF", save_all=True, append_images=frames[1:], duration=80, loop=0)
-        print(f"wrote {common.write_whole(Path(OUT) / 'figures' / f'{maze}.gif', buffer.getvalue())}")
-
-
-DRAWINGS = dict(fig03=draw_fig03, fig06=draw_fig06, fig07=draw_fig07, fig14=draw_fig14, gif=draw_gif,
+DRAWINGS = dict(fig03=draw_fig03, fig06=draw_fig06, fig07=draw_fig07, fig14=partial(rendered, name="fig14"),
+                gif=partial(rendered, name="gif"),
                 fig08=partial(draw_examples, "fig08_mpc_examples", "sparse"),
                 fig17=partial(draw_examples, "fig17_more_examples", "dense"),
                 fig18=partial(draw_examples, "fig18_s_maze_obstacles", "dense"))
-NEED_GL = {"fig14", "gif"}
 
 if __name__ == "__main__":
     main()

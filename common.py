@@ -13,6 +13,7 @@ import io
 import json
 import math
 import os
+import re
 import signal
 import sys
 import tokenize
@@ -20,11 +21,8 @@ import typing
 from pathlib import Path
 
 os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend would fail here
-if sys.platform == "linux":  # before mujoco loads: GLFW aborts without a screen
-    LIBRARIES = dict(egl="EGL", osmesa="OSMesa")
-    chosen = os.environ.setdefault("MUJOCO_GL", "egl")
-    if chosen not in ("glfw", "disable", "") and not ctypes.util.find_library(LIBRARIES.get(chosen, chosen)):
-        os.environ["MUJOCO_GL"] = "disable"  # who draws says so
+if sys.platform == "linux":  # before mujoco loads: without a screen its default, GLFW, aborts
+    os.environ["MUJOCO_GL"] = "egl" if ctypes.util.find_library("EGL") else "disable"
 
 import matplotlib.pyplot as plt
 import mujoco
@@ -46,7 +44,7 @@ CLASSES = dict(speed=4, direction=4, curvature=3, acceleration=3, x=4, y=4)  # o
 FRAME_SKIP: Count = 5     # physics steps of 0.01 s per environment step
 FEEDBACK: Share = 0.1     # closed loop: share of the distance to the reference that commands gain (paper: 0)
 CORRECTION: float = 0.2   # closed loop: the longest such gain, trajectory units
-FORMAT = 4                # of the artifacts; raise it when their meaning changes
+FORMAT = 5                # of the artifacts; raise it when their meaning changes
 HERE = Path(__file__).resolve().parent
 SCRIPT = {"dataset": "01_make_dataset.py", "wetvae": "02_train_wetvae.py", "policy": "03_train_policy.py"}
 
@@ -71,14 +69,13 @@ def weak_labels(factors, names, ranges):
 
 class Decoder(nn.Module):
     """p_theta(tau | z), Fig 1: an LSTM over z and its own last mean -> a Gaussian over the next displacement.
-    The trap: a decoder that reads the true last displacement needs no z, and z stays entangled. circle: index
-    of a latent that is an angle, a whole turn from -1.5 to 1.5; None: there is none."""
+    The trap: a decoder that reads the true last displacement needs no z, and z stays entangled."""
 
-    def __init__(self, z_dim, x_dim, hidden, circle=None):
+    def __init__(self, z_dim, x_dim, hidden):
         super().__init__()
-        self.arguments = (z_dim, x_dim, hidden, circle)
-        self.x_dim, self.circle = x_dim, circle
-        self.cell = nn.LSTMCell(x_dim + z_dim + (circle is not None), hidden)
+        self.arguments = (z_dim, x_dim, hidden)
+        self.x_dim = x_dim
+        self.cell = nn.LSTMCell(x_dim + z_dim, hidden)
         self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2 * x_dim))
         self.register_buffer("axes", torch.eye(z_dim))  # z -> latents: a signed permutation, set in stage 02
 
@@ -89,26 +86,12 @@ class Decoder(nn.Module):
     def decode_latents(self, latents, steps):
         """Latents (B, M), in the order and with the signs that training found -> mean and log-variance of the
         displacements, (B, steps, x_dim) each, trajectory units."""
-        latents = with_circle(latents, self.circle)
         mean, state, out = latents.new_zeros(len(latents), self.x_dim), None, []
         for _ in range(steps):
             state = self.cell(torch.cat([mean, latents], 1), state)
             out.append(self.head(state[0]))
             mean = out[-1][:, :self.x_dim]
         return torch.stack(out, 1).chunk(2, 2)
-
-
-def with_circle(latents, circle):
-    """Latents (B, M) as networks read them: the angle with index `circle`, of which 3 is a whole turn, as its
-    cosine and sine (B, M + 1)."""
-    if circle is None:
-        return latents
-    return torch.cat([latents[:, :circle], on_circle(latents[:, circle]), latents[:, circle + 1:]], 1)
-
-
-def on_circle(angle):
-    """Angle latents (B,), of which 3 is a whole turn -> cosine and sine (B, 2)."""
-    return torch.stack([(angle * 2 * math.pi / 3).cos(), (angle * 2 * math.pi / 3).sin()], 1)
 
 
 # -------- relation functions and commands, Sec. 4.2.2
@@ -385,13 +368,8 @@ def parse_flags(stage, argv=None):
     for name in kinds:
         text = f"{comments.get(name, '')} [{stage[name]}]".replace("%", "%%")
         parser.add_argument("--" + name.lower(), dest=name, metavar="VALUE", help=text)
-    arguments = []
-    for word in sys.argv[1:] if argv is None else argv:
-        if word.startswith("-") and word[1:2] in tuple("0123456789.") and arguments:
-            arguments[-1] += "=" + word  # a negative number is no flag
-        else:
-            arguments.append(word)
-    given = vars(parser.parse_args(arguments))
+    parser._negative_number_matcher = re.compile(r"-[\d.]")  # argparse takes -1e2 for a flag
+    given = vars(parser.parse_args(argv))
     row = {}
     if "EXPERIMENTS" in stage:
         experiment, rows = given.get("EXPERIMENT", stage["EXPERIMENT"]), stage["EXPERIMENTS"]
@@ -488,7 +466,8 @@ def load(out, kind, experiment, seed, **same):
     made = content["config"] | content
     for key, value in (dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed) | same).items():
         if made.get(key) != value:
-            stop(f"{path} was made with {key} = {made.get(key)}, not {value}: set {key} back, or {make}")
+            mend = f"set {key} back, or {make}" if key.isupper() else make
+            stop(f"{path} was made with {key} = {made.get(key)}, not {value}: {mend}")
     numbers = [np.asarray(leaf) for leaf in tree_leaves(content) if not isinstance(leaf, str)]
     if not all(np.isfinite(leaf).all() for leaf in numbers if leaf.dtype.kind == "f"):
         stop(f"{path} holds numbers that are not finite; {make}")
@@ -507,12 +486,11 @@ def update_csv(path, rows, key):
     replaced = {tuple(row[k] for k in key) for row in new}
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(f"{path}.lock", "w") as lock:  # seeds trained side by side share a file
-        with contextlib.suppress(ImportError):  # Windows has no fcntl
+        try:
             import fcntl
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX)
-            except OSError as error:
-                print(f"{path} is not locked ({error.strerror}): let no other run write it now")
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        except (ImportError, OSError) as error:  # Windows; some network drives
+            print(f"{path} is not locked ({error}): let no other run write it now")
         old = read_csv(path) if path.exists() else []
         rows = [row for row in old if tuple(row.get(k) for k in key) not in replaced] + new
         text = io.StringIO()

@@ -113,7 +113,7 @@ class Follow(gymnasium.Env):
         return torch.cat(common.to_base_frame(self.robots.observe(), self.command), 1)[0].numpy()
 
     def skill(self):
-        z = torch.from_numpy(self.rng.normal(size=(1, 2))).float()
+        z = torch.tensor([[*self.rng.normal(size=2), 0.0]], dtype=torch.float32)  # (z_single, 0)
         self.command, self.log_var = (v[:, 0] for v in self.decoder(z, 1))
 
     def reset(self, seed=None, options=None):

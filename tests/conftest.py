@@ -69,11 +69,10 @@ def tiny(out, **changed):
 def out(tmp_path):
     """A folder with decoders, untrained: the three that 03 uses, and one of x and y."""
     three = ["speed", "direction", "curvature"]
-    for name, x_dim, names, circle in (("main", 2, three, None), ("full_circle", 2, three, 1),
-                                       ("speed_acc", 1, ["speed", "acceleration"], None),
-                                       ("polar", 2, ["x", "y"], None)):
+    for name, x_dim, names in (("main", 2, three), ("full", 2, three), ("speed_acc", 1, ["speed", "acceleration"]),
+                               ("polar", 2, ["x", "y"])):
         torch.manual_seed(0)
-        common.save(tmp_path, "wetvae", name, 0, {}, decoder=common.Decoder(len(names), x_dim, 16, circle),
+        common.save(tmp_path, "wetvae", name, 0, {}, decoder=common.Decoder(len(names), x_dim, 16),
                     names=names, relation=dict(curvature=0.2) if len(names) == 3 else {}, abs_corr=[0.9] * len(names),
                     ranges={name: (-1.0, 1.0) for name in names}, length=5)
     return tmp_path

@@ -207,7 +207,7 @@ def test_a_constant_may_be_written_without_a_type_without_blanks_and_twice(edite
     (('"main": dict(', '"main": dict(TRAJECTORYS=5, '), (), "TRAJECTORYS in the row 'main' of EXPERIMENTS is no constant"),
     (("STRAIGHT: Share = 0.2", "STRAIGHT: Share = 20"), (), "--straight is 20, but must be a number from 0 to 1"),
     (("LENGTH: Count = 5", "LENGTH: Count = None"), (), "--length is None, but must be a whole number of at least 1"),
-    (("SPEED_LOW: float = 0.0", "SPEED_LOW: float = '0,1'"), (), "--speed_low is '0,1', but must be a number"),
+    (("SPEED_LOW: Signed = 0.0", "SPEED_LOW: Signed = '0,1'"), (), "--speed_low is '0,1', but must be a number"),
     ((), ("--trajectories", "1e12"), "lower --trajectories or --length"), ((), ("--length", "1e9"), "lower --trajectories"),
     ((), ("--seed", "1e20"), "--seed is '1e20', but must be a whole number of at least 0, below 2 ** 63")])
 def test_an_edit_that_makes_no_sense_is_one_line(edited, changes, flags, message):
@@ -271,6 +271,7 @@ def test_damaged_artifacts_are_refused_in_one_line(kind, damage, tmp_path, capsy
     error = capsys.readouterr().err
     assert end.value.code == 2 and len(error.splitlines()) == 1 and path.name in error
     assert f"make it with: python {common.SCRIPT[kind]} --seed 0 --experiment x" in error
+    assert "back, or" not in error  # a seed, a kind or a format cannot be set back
 
 
 def test_every_damage_is_found(tmp_path, capsys):
@@ -385,16 +386,21 @@ def test_a_table_in_another_form_is_one_line_and_stays(tmp_path, data, capsys):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no fcntl")
-@pytest.mark.parametrize("code", ["ENOLCK", "ENOTSUP", "EIO"])
-def test_a_file_system_without_locks_is_said_in_one_line_and_written(tmp_path, monkeypatch, capsys, code):
+@pytest.mark.parametrize("code", ["ENOLCK", "ENOTSUP", "EIO", None])
+def test_a_table_that_cannot_be_locked_is_said_in_one_line_and_written(tmp_path, monkeypatch, capsys, code):
+    """A file system without locks, or (None) a Python without fcntl."""
     import fcntl
 
     def fail(*_):
         raise OSError(getattr(errno, code), os.strerror(getattr(errno, code)))
-    monkeypatch.setattr(fcntl, "flock", fail)
+    if code:
+        monkeypatch.setattr(fcntl, "flock", fail)
+    else:
+        monkeypatch.setitem(sys.modules, "fcntl", None)
     common.update_csv(tmp_path / "t.csv", [dict(a="x", n=1)], ("a",))
     printed = capsys.readouterr()
-    assert printed.out.count("\n") == 1 and "not locked" in printed.out and not printed.err
+    assert printed.out.count("\n") == 1 and f"{tmp_path / 't.csv'} is not locked (" in printed.out and not printed.err
+    assert (os.strerror(getattr(errno, code)) if code else "fcntl") in printed.out
     assert common.read_csv(tmp_path / "t.csv") == [dict(a="x", n="1")]
 
 

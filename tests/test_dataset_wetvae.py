@@ -1,4 +1,4 @@
-"""Stages 1 and 2: Table 1, weak labels, Eq. 4, the circle, "check factors in z", and what a user runs and mistypes."""
+"""Stages 1 and 2: Table 1, weak labels, Eq. 4, "check factors in z", and what a user runs and mistypes."""
 import csv
 import math
 import os
@@ -89,6 +89,34 @@ def test_the_other_data_sets_by_differences(data):
             assert abs((f["acceleration"] == 0).mean() - 0.2) < 0.05 and 0.19 < abs(f["acceleration"]).max() <= 0.2
 
 
+def test_in_one_dimension_a_speed_may_have_any_range(fork, tmp_path):
+    for low, high in ((-0.5, 0.25), (0.2, 0.4)):
+        done = fork("01_make_dataset", "--out", tmp_path, "--experiment", "speed_acc", "--trajectories", 1000, "--length", 10,
+                    "--speed_low", low, "--speed_high", high)
+        assert done.returncode == 0, done.stderr
+        content = np.load(tmp_path / "dataset_speed_acc_seed0.npz")
+        speed, first = content["factors"][:, 0], content["trajectories"][:, 1, 0]
+        np.testing.assert_allclose(content["ranges"][0], (low, high))
+        np.testing.assert_allclose((speed.min(), speed.max()), (low, high), atol=0.01)
+        np.testing.assert_allclose(first, speed, atol=1e-6)
+
+
+def test_data_of_three_factors_hold_the_example(fork, data, tmp_path):
+    """Speed 0.6, direction 20 and curvature -10 degrees, step by step."""
+    assert fork("01_make_dataset", "--out", tmp_path, "--trajectories", 500, "--length", 3).returncode == 0
+    for out, experiment, length in ((data, "main", 5), (data, "full", 5), (tmp_path, "main", 3)):
+        points = [(0.0, 0.0)]
+        for t in range(length):
+            angle = math.radians(20 - 10 * t)
+            points.append((points[-1][0] + 0.6 * math.cos(angle), points[-1][1] + 0.6 * math.sin(angle)))
+        content = np.load(out / f"dataset_{experiment}_seed0.npz")
+        np.testing.assert_allclose(content["example"], [points], atol=1e-6)
+        assert content["example"].dtype == content["trajectories"].dtype  # 02 reads both alike
+        np.testing.assert_allclose(content["example_factors"], [(0.6, math.pi / 9, -math.pi / 18)])
+    for experiment in ("polar", "speed_acc", "four_factors"):
+        assert not [name for name in np.load(data / f"dataset_{experiment}_seed0.npz") if name.startswith("example")]
+
+
 def test_the_order_of_factors_is_that_of_z(fork, data, tmp_path):
     flags = ("--out", tmp_path, "--trajectories", 1000)
     assert fork("01_make_dataset", *flags, "--factors", "curvature direction speed").returncode == 0
@@ -99,12 +127,14 @@ def test_the_order_of_factors_is_that_of_z(fork, data, tmp_path):
 @pytest.mark.parametrize("flags, words", [
     (("--curvature", 0), "curvature never changes"), (("--direction", 0), "direction never changes"),
     (("--speed_low", 1), "speed never changes"), (("--straight", 1), "curvature never changes"),
-    (("--length", 1), "curvature needs --length 2 or more"), (("--speed_low", -1), "--speed_low"), (("--direction", 200), "from 0 to 180"),
-    (("--trajectories", 0), "at least 1"),
+    (("--length", 1), "curvature needs --length 2 or more"), (("--direction", 200), "from 0 to 180"),
+    (("--speed_low", -1), "with direction --speed_low must be at least 0"), (("--trajectories", 0), "at least 1"),
+    (("--experiment", "polar", "--speed_low", -1e-3), "with direction --speed_low must be at least 0"),
+    (("--experiment", "speed_acc", "--speed_low", 1), "speed never changes"),
+    (("--experiment", "speed_acc", "--acceleration", 0), "acceleration never changes"),
     (("--length", 0), "at least 1"), (("--length", 2.5), "whole number"),
     (("--factors", "direction"), "must name speed"), (("--factors", "speed height"), "must name speed"),
-    (("--factors", "speed curvature"), "need direction"),
-    (("--experiment", "speed_acc", "--length", 10), "less than 0.111")])
+    (("--factors", "speed curvature"), "curvature needs direction")])
 def test_01_ends_with_one_line(s1, inside, tmp_path, flags, words):
     done = inside(s1, "--out", tmp_path, *flags)
     assert one_line(done) and words in done.stderr and not list(tmp_path.glob("*.npz")), done.stderr
@@ -150,7 +180,7 @@ def test_purity_and_the_circle_of_directions():
 def test_objective_is_equation_4_term_by_term(s2):
     torch.manual_seed(0)
     encoder, decoder = s2.Encoder(2, 7, 3, 16), s2.Decoder(3, 2, 16)
-    heads = s2.LabelDecoders(["speed", "curvature"], 3, 16, None, False)
+    heads = s2.LabelDecoders(["speed", "curvature"], 3, 16, False)
     x, y = torch.randn(50, 5, 2), torch.stack([torch.randint(4, (50,)), torch.randint(3, (50,))], 1)
     one_hot = torch.zeros(50, 7)
     one_hot[range(50), y[:, 0]] = 1
@@ -205,7 +235,7 @@ def test_beta_grows_over_the_first_half_and_the_learning_rate_falls(s2, monkeypa
 
 def test_labels_are_read_from_their_own_latent_in_order(s2):
     names = ["speed", "curvature"]
-    own, printed = (s2.LabelDecoders(names, 2, 16, None, flag) for flag in (True, False))
+    own, printed = (s2.LabelDecoders(names, 2, 16, flag) for flag in (True, False))
     z = torch.randn(50, 2, requires_grad=True)
     for heads, crosses in ((own, False), (printed, True)):
         gradient = torch.autograd.grad(heads(z)[0].square().sum(), z)[0]
@@ -216,49 +246,10 @@ def test_labels_are_read_from_their_own_latent_in_order(s2):
     assert speed in ([0, 1, 2, 3], [3, 2, 1, 0]) and curvature == [2, 0, 1]  # right, straight, left
 
 
-# ---------------------------------------------------------------- the circle
-
-def test_label_classes_on_the_circle_are_the_weak_labels(s2):
-    """With canonical z_dir = direction * 3 / (2 pi) the likeliest class is the weak label, at every angle."""
-    heads = s2.LabelDecoders(["speed", "direction"], 2, 16, 1, True)
-    direction = np.linspace(-3.14, 3.14, 1000)
-    z = torch.stack([torch.zeros(1000), torch.from_numpy(direction * 3 / (2 * math.pi)).float()], 1)
-    labels = common.weak_labels(dict(direction=direction), ["direction"], FULL)[:, 0]
-    assert (heads(z)[1].argmax(1).numpy() == labels).mean() > 0.995
-
-
-def test_the_divergence_on_the_circle_by_integration(s2):
-    log_var = torch.full((1, 2), 2 * math.log(0.15))
-    kl = s2.divergence(torch.tensor([[0.5, 1.4]]), log_var, 1)
-    grid = np.linspace(-1.5, 1.5, 200_001)
-    p = np.exp(-0.5 * (grid / 0.15) ** 2) / (0.15 * math.sqrt(2 * math.pi))  # in the middle: the prior is uniform
-    assert kl[0, 1].item() == pytest.approx(np.trapezoid(p * np.log(np.maximum(p, 1e-300) * 3), grid), abs=1e-4)
-    assert kl[0, 0].item() == pytest.approx(D.kl_divergence(D.Normal(0.5, 0.15), D.Normal(0.0, 1.0)).item(), abs=1e-5)
-    assert s2.divergence(torch.zeros(1, 2), torch.full((1, 2), 4.0), 1)[0, 1] == 0  # wider than the turn
-
-
-def test_encoder_and_decoder_close_the_circle(s2):
-    torch.manual_seed(0)
-    decoder = common.Decoder(2, 2, 16, 1)
-    z = torch.tensor([[0.3, 1.5], [0.3, -1.5], [0.3, 0.0]])
-    mean = decoder(z, 3)[0]
-    torch.testing.assert_close(mean[0], mean[1])
-    assert not torch.allclose(mean[0], mean[2])
-    encoder = s2.Encoder(2, 0, 2, 16, 1)
-    for angle in (3.0, -3.0, 0.5):  # the direction of outputs (mean of the latent, last)
-        encoder.head[2].weight.data.zero_()
-        encoder.head[2].bias.data = torch.tensor([0.7, 2 * math.cos(angle), 0.1, 0.2, 2 * math.sin(angle)])
-        mean, log_var = encoder(torch.randn(1, 5, 2), torch.zeros(1, 0))
-        np.testing.assert_allclose(mean[0].tolist(), [0.7, angle * 3 / (2 * math.pi)], rtol=1e-5)
-        np.testing.assert_allclose(log_var[0].tolist(), [0.1, 0.2], rtol=1e-5)
-
-
 # ---------------------------------------------------------------- Alg. 1, "Test: check factors in z"
 
 class ClosedForm:
     """A decoder by a formula: latents (B, M), steps -> displacements."""
-    circle = None
-
     def __init__(self, z_dim, formula):
         self.axes, self.formula = torch.eye(z_dim), formula
 
@@ -288,21 +279,27 @@ def test_an_unused_latent_correlates_with_nothing(s2):
     assert speed == pytest.approx(1) and acceleration == 0
 
 
-def test_the_shipped_decoder_means_what_its_axes_say(tmp_path):
-    for experiment, full in (("main", False), ("full_circle", True)):
-        model = common.load(tmp_path, "wetvae", experiment, 0)
-        decoder = model["decoder"]
-        assert model["names"] == ["speed", "direction", "curvature"] and model["length"] == 5
-        for axis, name in enumerate(model["names"]):
-            z = torch.zeros(7, 3)
-            z[:, axis] = torch.linspace(-1, 1, 7)
-            found = common.factors_of(decoder(z, 5)[0].double().numpy(), model["names"])[name]
-            assert (np.diff(found) > 0).all(), name  # + is faster, counter-clockwise, left
-            if name == "direction" and full:
-                np.testing.assert_allclose(found, z[:, axis] * 2 * math.pi / 3, atol=0.35)
+@pytest.mark.parametrize("experiment, most", [("main", 90), ("full", 180)])
+def test_the_shipped_decoder_means_what_its_axes_say(tmp_path, experiment, most):
+    """most: degrees, the largest direction of the data."""
+    model = common.load(tmp_path, "wetvae", experiment, 0)
+    assert model["names"] == ["speed", "direction", "curvature"] and model["length"] == 5
+    for axis, name in enumerate(model["names"]):
+        z = torch.zeros(7, 3)
+        z[:, axis] = torch.linspace(-1.5, 1.5, 7)
+        found = common.factors_of(model["decoder"](z, 5)[0].double().numpy(), model["names"])[name]
+        assert (np.diff(found) > 0).all(), name  # + is faster, counter-clockwise, left
+        if name == "direction":
+            assert -most < np.degrees(found[0]) < -most / 2 and most / 2 < np.degrees(found[-1]) < most
 
 
 # ---------------------------------------------------------------- as a user runs it
+
+GROUPS = {  # experiment and labels in results/wetvae.csv: a model beside which others differ, and in what
+    "main": ("main", "main"), "main_none": ("main", "none"), "polar_cartesian": ("polar", "cartesian"), "polar": ("polar", "polar"),
+    "full": ("full", "full"), "speed_acc_none": ("speed_acc", "none"), "seeds_own_axis": ("seeds", "own_axis"),
+    "beta_gamma": ("beta_gamma", "beta_gamma"), "beta_gamma_b3_g10": ("beta_gamma", "b3_g10")}
+
 
 @pytest.mark.parametrize("name", STAGE.MODELS)
 def test_each_model_alone_from_training_to_figure(s2, inside, out, name, monkeypatch):
@@ -310,7 +307,7 @@ def test_each_model_alone_from_training_to_figure(s2, inside, out, name, monkeyp
     drawn = []
     before = {key: value for key, value in vars(s2).items() if key.isupper()}
     monkeypatch.setattr(s2, "train", lambda *given, train=s2.train: (
-        drawn.append({key: getattr(s2, key) for key in ("BETA", "GAMMA", "LABELS", "CIRCLE")}) or train(*given)))
+        drawn.append({key: getattr(s2, key) for key in ("BETA", "GAMMA", "LABELS", "DATA")}) or train(*given)))
     done = inside(s2, "--out", out, "--experiment", name, *TINY)
     assert done.returncode == 0, done.stderr
     assert drawn == [{key: before[key] for key in drawn[0]}]  # a model is handed its settings: no global changes
@@ -318,6 +315,7 @@ def test_each_model_alone_from_training_to_figure(s2, inside, out, name, monkeyp
     names = model["names"]
     rows = rows_of(out)
     assert [row["factor"] for row in rows] == names and {row["settings"] for row in rows} == {model["settings"]}
+    assert {(row["experiment"], row["labels"]) for row in rows} == {GROUPS.get(name, (rows[0]["experiment"], rows[0]["labels"]))}
     assert set(model["ranges"]) == set(names) and len(model["abs_corr"]) == len(names) and model["length"] == 5
     axes = model["decoder"].axes
     torch.testing.assert_close(axes @ axes.T, torch.eye(len(names)))  # a signed permutation
@@ -338,6 +336,7 @@ def test_a_figure_trains_and_shows_its_models(s2, fork, out, figure):
 
 
 def test_the_columns_of_figures_are_models(s2):
+    assert set(GROUPS) <= set(s2.MODELS)
     assert {model for columns in s2.FIGURES.values() for _, model, _ in columns} <= set(s2.MODELS)
 
 
@@ -371,6 +370,27 @@ def test_the_example_of_all_four_scripts():
         assert (common.weak_labels(found, list(found), ranges)[0] + 1).tolist() == labels
 
 
+def test_the_example_of_the_data_goes_through_encoder_and_axes(s2, inside, out, monkeypatch):
+    """By hand: labels 3, 2, 3 of 4, 4 and 3 classes; the decoder turns z of the artifact into the encoder's mean."""
+    turned = torch.tensor([[0.0, -1, 0], [0, 0, 1], [1, 0, 0]])  # not its own inverse
+    monkeypatch.setattr(s2, "check_factors", lambda decoder, *_: decoder.axes.copy_(turned).diagonal())
+    done = inside(s2, "--out", out, "--experiment", "main", *TINY)
+    model, encoder, one_hot = artifact(out, "main"), s2.Encoder(2, 11, 3, 16), torch.zeros(1, 11)
+    encoder.load_state_dict(model["encoder"])
+    one_hot[0, [2, 4 + 1, 8 + 2]] = 1
+    heading = torch.deg2rad(torch.tensor([20.0, 10, 0, -10, -20]))
+    mean, _ = encoder(0.6 * torch.stack([heading.cos(), heading.sin()], 1)[None], one_hot)
+    torch.testing.assert_close(torch.tensor([model["example"]]) @ model["decoder"].axes, mean, atol=1e-5, rtol=1e-5)
+    assert "encoded: z = speed {:+.2f}, direction {:+.2f}, curvature {:+.2f}".format(*model["example"]) in done.stdout
+
+
+def test_beta_gamma_is_eq_4_as_printed():
+    as_printed = dict(BETA=9, GAMMA=10, OWN_AXIS=False, BETA_WARM_UP=0)
+    config = {name: getattr(STAGE, name) for name in common.types_of(vars(STAGE))}
+    assert STAGE.hyperparameters("beta_gamma", config, {}) == STAGE.hyperparameters("main", config, as_printed)
+    assert STAGE.hyperparameters("beta_gamma_b1_g10", config, {}) == STAGE.hyperparameters("main", config, as_printed | dict(BETA=1))
+
+
 def test_a_loss_that_is_not_finite_overwrites_nothing(fork, out):
     done = fork("02_train_wetvae", "--out", out, *TINY, "--learning_rate", 1e30)
     assert one_line(done, 1) and "nothing was overwritten" in done.stderr and not list(out.glob("*.pt")), done.stderr
@@ -379,18 +399,16 @@ def test_a_loss_that_is_not_finite_overwrites_nothing(fork, out):
 def test_settings_of_a_model_have_the_same_digits_for_all_seeds(s2, inside, out):
     for seed in (0, 1):
         if seed:
-            os.link(out / "dataset_full_seed0.npz", out / "other")
-            assert inside(script("01_make_dataset"), "--out", out, "--experiment", "full", "--seed", 1,
+            assert inside(script("01_make_dataset"), "--out", out, "--experiment", "speed_acc", "--seed", 1,
                           "--trajectories", 1000).returncode == 0
-        done = inside(s2, "--out", out, "--experiment", "full_circle_traversals", "--seed", seed, *TINY)
+        done = inside(s2, "--out", out, "--experiment", "fig12_speed_acceleration", "--seed", seed, *TINY)
         assert done.returncode == 0, done.stderr
     digits = {(row["seed"], row["labels"]): row["settings"] for row in rows_of(out)}
     assert len(digits) == 4 and len(set(digits.values())) == 2  # a model of each label, whatever the seed
-    assert digits["0", "full"] == digits["1", "full"] != digits["1", "circle"]
+    assert digits["0", "speed_acc"] == digits["1", "speed_acc"] != digits["1", "none"]
 
 
 @pytest.mark.parametrize("flags, words", [
-    (("--circle", "true"), "model main, data set main: --circle true needs"), (("--experiment", "full_circle", "--own_axis", "false"), "--own_axis"),
     (("--labels", "speed acceleration"), "acceleration"), (("--labels", ""), "must be factors"),
     (("--base", "0 0"), "unrecognized arguments: --base"), (("--batch", 0), "--batch"), (("--epochs", 0), "--epochs"),
     (("--batch", 1001), "fewer than --batch"), (("--labels", "x y"), "of class 1"), (("--hidden", 2.5), "whole number"),
@@ -404,9 +422,9 @@ def test_02_ends_with_one_line_before_training(s2, inside, out, flags, words):
 def test_data_of_other_settings_just_work(fork, tmp_path):
     made = ("--trajectories", 1000, "--length", 2, "--direction", 180, "--speed_low", 0.5)
     assert fork("01_make_dataset", "--out", tmp_path, *made).returncode == 0
-    done = fork("02_train_wetvae", "--out", tmp_path, "--experiment", "full_circle", "--data", "main", *TINY)
+    done = fork("02_train_wetvae", "--out", tmp_path, "--experiment", "full", "--data", "main", *TINY)
     assert done.returncode == 0, done.stderr
-    model = artifact(tmp_path, "full_circle")
+    model = artifact(tmp_path, "full")
     assert model["length"] == 2 and model["ranges"]["speed"] == [0.5, 1]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import cli, load_policy
+from extras import render
 
 COLUMNS = ("maze reward method mode look_ahead samples seed planning_ms policy_seed policy settings trial final_distance "
            "success").split()
@@ -404,8 +405,8 @@ def test_each_row_of_experiments_runs(s4, stage, experiment, out, policies, monk
         assert found == {(*one, seed) for one in wanted for seed in shipped.get(one[0], (0, 1, 2))}
         assert {c.trials for c, _, _ in runs(s4, out, experiment=experiment)} == {20}
         flags |= dict(policy_seeds=0)
-    monkeypatch.setattr(s4, "can_render", lambda: True)
-    monkeypatch.setattr(s4, "render", lambda model, poses, high, wide: [np.zeros((high, wide, 3), np.uint8) for _ in poses])
+    monkeypatch.setattr(render, "can_render", lambda: True)
+    monkeypatch.setattr(render, "render", lambda model, poses, high, wide: [np.zeros((high, wide, 3), np.uint8) for _ in poses])
     done = stage(experiment=experiment, draw=None, **flags)
     assert done.code == 0, done.err
     assert list(done.rows[0]) == COLUMNS
@@ -465,7 +466,12 @@ def test_figures_show_the_modes_side_by_side(s4, stage, out, monkeypatch):
         assert drawn[name].axes[0].get_gridspec().ncols == 3
     path = drawn["fig08_mpc_examples"].axes[0]
     assert len(path.patches) == len(s4.MAZE["maze1"]["WALLS"]) and len(path.lines) == 2 + 2 + 1  # one skill, one trial
-    assert [ax.get_title().partition(":")[0] for ax in drawn["fig03_trajectory_scaling"].axes] == MODES * 2
+    small, scaled = drawn["fig03_trajectory_scaling"].axes  # the first mode's first plan, one skill, and what was executed
+    assert [ax.get_title() for ax in (small, scaled)] == ["printed: predicted", "printed: scaled by $H_z$ = 40"]
+    assert len(small.lines) == 1 and len(scaled.lines) == 2 and scaled.lines[1].get_xydata().shape == (201, 2)
+    planned = drawn["fig17_more_examples"].axes[0].lines[3].get_xydata()  # behind start, goal and error
+    for ax, scale in ((small, 40), (scaled, 1)):
+        np.testing.assert_allclose(scale * ax.lines[0].get_xydata(), planned - planned[0], atol=1e-5)
     done = stage(mazes="maze1", rewards="dense", draw="fig08")
     assert done.code == 0 and "no fig08_mpc_examples: no trial has the sparse reward" in done.out
 
@@ -601,8 +607,9 @@ def test_command_line_draws_everything_and_repeats_itself(fork, out):
 
 
 def test_without_a_gl_library_one_line_says_so(out):
+    (out / "sitecustomize.py").write_text("import ctypes.util\nctypes.util.find_library = lambda name: None\n")
     done = cli("04_mpc_maze", "--out", out, "--trials", 1, "--samples", 2, "--pool", 64, "--episode", 200, "--draw",
-               "fig14 gif", "--threads", 1, MUJOCO_GL="disable")
+               "fig14 gif", "--threads", 1, PYTHONPATH=str(out))
     assert done.returncode == 0 and done.stdout.count("no Fig 14, no GIF: MuJoCo's renderer finds no GL library") == 1, done.stderr
 
 

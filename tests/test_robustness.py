@@ -1,5 +1,6 @@
 """What happens to people: Ctrl-C, kill -9, a full disk, a notebook's environment, settings that make no sense, and
 every constant changed. An error is one line, and nothing that was saved is lost."""
+import os
 import re
 import signal
 import subprocess
@@ -33,7 +34,7 @@ def shell(command):
 
 def test_output_into_head(tmp_path):
     done = shell(f"{sys.executable} -u {ROOT}/{S1}.py --out {tmp_path} --trajectories 500 | head -n 1")
-    assert done.stdout.startswith("wrote ") and done.stdout.count("\n") == 1 and done.stderr == ""
+    assert done.stdout.count("\n") == 1 and done.stderr == ""
 
 
 @pytest.mark.parametrize("text", ["text.usetex: True", "backend: TkAgg\nfont.family: No Such Font\naxes.unicode_minus: maybe"])
@@ -46,9 +47,19 @@ def test_a_readers_matplotlibrc_does_not_matter(text, tmp_path):
 
 @pytest.mark.parametrize("library", ["osmesa", "nonsense", "glfw"])
 def test_a_stage_that_renders_nothing_needs_no_gl_library(library, tmp_path):
-    """MUJOCO_GL may name a library that is not there."""
+    """MUJOCO_GL may name a library that is not there: it does not count."""
     done = cli(S1, "--out", tmp_path, "--trajectories", 500, MUJOCO_GL=library)
     assert done.returncode == 0 and not done.stderr, done.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere MuJoCo's own choice stays")
+@pytest.mark.parametrize("found, chosen", [(None, "disable"), ("libEGL.so.1", "egl")])
+def test_mujoco_renders_with_egl_or_not_at_all(found, chosen):
+    code = f"import ctypes.util, os, sys; sys.path.insert(0, {str(ROOT)!r}); sys.modules['mujoco'] = None\n" \
+           f"ctypes.util.find_library = dict(EGL={found!r}).get\n" \
+           "try: import common\nexcept ImportError: print(os.environ['MUJOCO_GL'])"  # chosen before mujoco loads
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ | dict(MUJOCO_GL="glfw"))
+    assert done.stdout == chosen + "\n", done.stderr
 
 
 def test_a_full_disk_is_one_line_and_the_old_file_stays(tmp_path):
@@ -106,13 +117,12 @@ def test_killed_three_times_it_ends_with_the_same_bits(fork, out):
     ("--experiment ant_dads --decoder speed_acc", "predicts 1 coordinates"),
     ("--experiment half_cheetah --decoder main", "predicts 2 coordinates"),
     ("--experiment half_cheetah --base_frame true", "--base_frame false"),
-    ("--experiment ant_sectar --z_dim 2", "--z_dim 3 or more"),
     ("--experiment ant_dads --robot half_cheetah", "--robot ant"), ("--experiment ant_dads --z_dim 3", "--z_dim 2"),
     ("--decoder nope", "python 02_train_wetvae.py --seed 0 --experiment nope"),
-    ("--experiment ant_full --seed 7", "python 02_train_wetvae.py --seed 7 --experiment full_circle"),
+    ("--experiment ant_full --seed 7", "python 02_train_wetvae.py --seed 7 --experiment full\n"),
     ("--robots 2.5", "a whole number"), ("--decoder_seed 7", "unrecognized arguments: --decoder_seed"),
     ("--experiment ant_dads --multi_run 2,5", "must be 1"), ("--robots 1e7", "lower --replay or --robots"),
-    ("--replay 1e12", "lower --replay or --robots"), ("--warm_up 1 --robots 1", "--warm_up must be at least 2"),
+    ("--replay 1e12", "lower --replay or --robots"),
     ("--method ppo", "--method is wedis, dads or sectar"), ("--robot dog", "--robot is ant or half_cheetah"),
     ("--train false", "python 03_train_policy.py --seed 0 --experiment ant_semi"),
     ("--seed 98", "python 02_train_wetvae.py --seed 98 --experiment main"),
@@ -127,20 +137,26 @@ def test_03_ends_in_one_line_before_training(flags, message, s3, inside, out, mo
     assert one_line(done, 2) and message in done.stderr, done.stderr
 
 
-def test_a_checkpoint_of_another_decoder_is_one_line_and_a_weak_decoder_is_said_aloud(s3, inside, out):
-    done = inside(s3, *tiny(out))
-    assert done.returncode == 0 and "no latent" not in done.stdout
+def test_a_checkpoint_of_another_decoder_is_one_line(s3, inside, out):
+    assert inside(s3, *tiny(out)).returncode == 0
     model = common.load(out, "wetvae", "main", 0)
     common.save(out, "wetvae", "main", 0, {}, **{key: model[key] for key in ("decoder", "names", "relation", "ranges", "length")},
                 abs_corr=[0.9, 0.1, 0.9])
-    done = inside(s3, *tiny(out), "--resume", "true")  # the same decoder: it may go on
-    assert done.returncode == 0 and "the decoder main has no latent that means direction" in done.stdout, done.stderr
+    done = inside(s3, *tiny(out), "--resume", "true")  # the same decoder in another file: it may go on
+    assert done.returncode == 0, done.stderr
     common.save(out, "wetvae", "main", 0, {}, decoder=common.Decoder(3, 2, 16), abs_corr=[0.9] * 3,
                 **{key: model[key] for key in ("names", "relation", "ranges", "length")})
     for flag in ("--resume", "true"), ("--train", "false"):
         done = inside(s3, *tiny(out), *flag)
         assert one_line(done, 2) and "another decoder main" in done.stderr and "train anew" in done.stderr
     assert inside(s3, *tiny(out)).returncode == 0  # the mend that it names
+
+
+@pytest.mark.parametrize("flags", ["--robots 1 --warm_up 1", "--experiment ant_sectar --z_dim 1"])
+def test_the_smallest_trainings_run(flags, s3, inside, out):
+    """One random step has no deviation; SeCTAR's z may be a number."""
+    done = inside(s3, *tiny(out), *flags.split())
+    assert done.returncode == 0 and not done.stderr, done.stderr
 
 
 @pytest.mark.parametrize("experiment", ["ant_semi", "ant_dads", "ant_sectar"])
@@ -164,8 +180,8 @@ SMALL = {S1: dict(TRAJECTORIES=300), S2: dict(EXPERIMENT="main", EPOCHS=1, BATCH
 DADS, SECTAR = dict(METHOD="dads", Z_DIM=2, MULTI_RUN="1 4"), dict(METHOD="sectar", Z_DIM=4)
 WITH = {  # what else is set so that a constant means something, or fits
     **{(S3, name): DADS for name in "MODEL_BATCH MODEL_UPDATES PRIOR_SAMPLES RECENT".split()},
-    **{(S3, name): SECTAR for name in "Z_DIM EXPLORE EXPLORER KL_WEIGHT".split()},
-    (S3, "EPISODE"): dict(SKILL_STEPS=1), (S2, "EPOCHS"): dict(BATCH=300), (S1, "ACCELERATION"): dict(FACTORS="speed acceleration")}
+    (S3, "Z_DIM"): SECTAR, (S3, "EPISODE"): dict(SKILL_STEPS=1), (S2, "EPOCHS"): dict(BATCH=300),
+    (S1, "ACCELERATION"): dict(FACTORS="speed acceleration")}
 DRIVING = ("OUT", "DRIVE", "SECONDS", "PORT")  # test_drive.py
 DATA = dict(names=np.array(["speed", "direction", "curvature"]), ranges=np.array([(0, 1), (-1.57, 1.57), (-0.5, 0.5)]))
 DRAWN = np.random.default_rng(0).uniform(DATA["ranges"][:, 0], DATA["ranges"][:, 1], (300, 3))
@@ -271,13 +287,13 @@ PAPER = papers_values()
 TOO_LONG = {(S3, "UPDATES"): 1_920_000}  # a day
 NO_NUMBER = {(S4, "POOL"): "no pool"}
 ONE_LINE = {  # values that are in range and rightly end in one line; of a learning rate also: with code 1
-    (S1, "LENGTH"): [1], (S1, "DIRECTION"): [0], (S1, "CURVATURE"): [0], (S1, "SPEED_LOW"): [1], (S1, "STRAIGHT"): [1],
-    (S1, "ACCELERATION"): [0, 1], (S3, "DISCOUNT"): [1], (S3, "Z_DIM"): [1], (S4, "EPISODE"): [1],
+    (S1, "LENGTH"): [1], (S1, "DIRECTION"): [0], (S1, "CURVATURE"): [0], (S1, "SPEED_LOW"): [-1, 1], (S1, "STRAIGHT"): [1],
+    (S1, "ACCELERATION"): [0], (S3, "DISCOUNT"): [1], (S4, "EPISODE"): [1],
     (S2, "SEED"): [1], (S3, "SEED"): [1]}  # there is no such data set, or decoder
 OFF = {  # constants that 0 switches off, whatever their declared types
     S1: "SPEED_LOW STRAIGHT", S2: "GAMMA BETA BETA_WARM_UP",
-    S3: "RELABELLED CORRECTED DECAY_FROM AVERAGED DISCOUNT SMOOTHING REWARD_SCALE TEMPERATURE FLOOR_START FLOOR_END FLOOR_FROM "
-        "FLOOR_UNTIL EXPLORE KL_WEIGHT", S4: "LOOK_AHEAD PENALTY REWARD_WEIGHT EPSILON RADIUS Z_RANGE"}
+    S3: "RELABELLED CORRECTED DISCOUNT SMOOTHING REWARD_SCALE TEMPERATURE FLOOR_START FLOOR_END",
+    S4: "LOOK_AHEAD PENALTY REWARD_WEIGHT EPSILON RADIUS Z_RANGE"}
 MAY_DIVERGE = [(S2, "LEARNING_RATE"), (S3, "LEARNING_RATE")]
 
 

@@ -10,6 +10,7 @@ BUDGETS = {  # lines of the file, lines of the method
     "common": (430, 260)}
 MARKER = "# ======== not needed to understand the method"
 FILES = pytest.mark.parametrize("name", BUDGETS)
+TOO_LONG = ["03_train_policy", "04_mpc_maze", "common"]  # more must go before they are as short as DESIGN asks
 
 
 def read(name):
@@ -27,8 +28,8 @@ def test_the_method_keeps_to_its_budget(name):
     assert marker - first <= BUDGETS[name][1]
 
 
-@pytest.mark.xfail(strict=True, reason="more ideas must go before the files are as short as DESIGN asks")
-@FILES
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.xfail(strict=True, reason=f"{name} is too long"))
+                                  if name in TOO_LONG else name for name in BUDGETS])
 def test_a_file_keeps_to_its_budget(name):
     lines, *_ = read(name)
     assert len(lines) <= BUDGETS[name][0], f"{len(lines)} of {BUDGETS[name][0]} lines"
