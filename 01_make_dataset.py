@@ -57,7 +57,6 @@ def main():
     check(FACTORS.split(), limits)
     names = [name for name in limits if name in FACTORS.split()]  # this order is that of z in all stages
     unit = dict(speed=1.0, direction=math.pi / 180, curvature=math.pi / 180, acceleration=1.0)
-
     rng = np.random.default_rng(SEED)
     factors = {name: unit[name] * rng.uniform(*limits[name], TRAJECTORIES) for name in names}  # Table 1
     for name in names:

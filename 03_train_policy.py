@@ -79,8 +79,8 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs
                          VARIANCE_SCALE=0.05, ROBOTS=64, SKILL_STEPS=100, CORRECTED=0.5, DISCOUNT=0.97,
                          Z_RANGE=1.0, MULTI_RUN=(6, 20), FIGURE="fig16_half_cheetah"),
     "ant_world_frame": dict(BASE_FRAME=False),  # the paper's frame
-    "ant_dads": dict(METHOD="dads", UPDATES=88_000, Z_RANGE=1.0, SKILL_STEPS=200, REWARD_SCALE=1.0, DISCOUNT=0.995,
-                     MULTI_RUN=(1, 200), FIGURE="fig05_skills_dads"),
+    "ant_dads": dict(METHOD="dads", UPDATES=88_000, Z_RANGE=1.0, SKILL_STEPS=200, REWARD_SCALE=1.0,
+                     DISCOUNT=0.995, MULTI_RUN=(1, 200), FIGURE="fig05_skills_dads"),  # WEDIS's minutes
     "ant_sectar": dict(METHOD="sectar", UPDATES=80_000, Z_DIM=8, SKILL_STEPS=50, RECENT=512_000,
                        MODEL_BATCH=128, REWARD_SCALE=1.0, SINGLE_RUN=(50, 1), MULTI_RUN=(50, 1),
                        FIGURE="fig05_skills_sectar"),
