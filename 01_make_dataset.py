@@ -19,7 +19,7 @@ FIGURE: str = ""              # name of the figure, if factors have one ("": dat
 
 TRAJECTORIES: Count = 100_000  # N, App. A.1.1
 LENGTH: Count = 5             # T, transitions per trajectory
-FACTORS: str = "speed direction curvature"  # without direction trajectories have one dimension
+FACTORS: str = "speed direction curvature"  # if direction is left out, trajectories have one dimension
 SPEED_LOW: Signed = 0.0       # speed ~ U(SPEED_LOW, SPEED_HIGH), Table 1, trajectory units per transition
 SPEED_HIGH: Positive = 1.0    # in one dimension a speed has a sign
 DIRECTION: Degrees = 90.0     # direction ~ U(-DIRECTION, DIRECTION), degrees: the right-sided semicircle
@@ -39,8 +39,8 @@ EXAMPLE = dict(speed=np.array([0.6]), direction=np.radians([20.0]), curvature=np
 
 
 def make_trajectories(speed, direction=None, curvature=0.0, acceleration=0.0, length=5):
-    """Factors (N,) each, angles in radians -> points (N, length + 1, 2), App. A.1.1. The first transition has
-    length `speed` and heading `direction`; each next one turns by `curvature` and is longer by `acceleration`
+    """Factors (N,) each, angles in radians -> points (N, length + 1, 2), App. A.1.1. The first transition is
+    `speed` long and points in `direction`; each next one turns by `curvature` and is longer by `acceleration`
     times `speed`. Without direction: one dimension, (N, length + 1, 1), in which the speed has a sign."""
     t = np.arange(length)
     steps = (speed[:, None] * (1 + np.multiply.outer(acceleration, t)))[..., None]

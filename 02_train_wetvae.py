@@ -1,10 +1,10 @@
 """Stage 2: trajectories -> WET-VAE: disentangled skills and their decoder (Sec. 4.1, App. A.1.2).
 
-In: runs/dataset_*.npz of 01. Trains the WET-VAE (Eq. 4) and, to compare, the same model without labels (the
-trajectory VAE), finds which latent is which factor, and the relation functions. Out, below runs/:
-wetvae_<model>_seed<seed>.pt, a figure and results/wetvae.csv. Takes 35 s, 1.7 minutes with the trajectory VAE
-(one core). Expect (speed, direction, curvature; mean of 10 seeds) purity 0.91, 0.91, 0.92; the axes cover 67,
-74, 54 % of the factors' ranges.
+In: runs/dataset_*.npz of 01. Trains the WET-VAE (Eq. 4) and, to compare, the trajectory VAE (NONE: no labels,
+beta 1, twice the epochs), finds which latent is which factor, and the relation functions. Out, below runs/:
+wetvae_<model>_seed<n>.pt, a figure and results/wetvae.csv. Takes 1.7 minutes on one core, --experiment main
+35 s. Expect (speed, direction, curvature; mean of 10 seeds) purity 0.91, 0.91, 0.92; the axes cover 67, 74,
+54 % of the factors' ranges.
 """
 import itertools
 import math
@@ -30,7 +30,7 @@ THREADS: Count = 1           # CPU threads: two are no faster, and three times s
 DATA: str = "main"           # experiment of 01 to train on
 LABELS: str = "speed direction curvature"  # the M factors of interest: a latent and a weak label y^m for each
 LABELLED: bool = True        # false: without the weak labels, the trajectory VAE (Co-Reyes et al. 2018)
-OWN_AXIS: bool = True        # p(y^m | z^m): label m is read from latent m alone (the paper: from all of z)
+OWN_AXIS: bool = True        # label m is read from latent m alone (the paper: from all of z; axes can mix)
 GAMMA: float = 10.0          # weight of the label log-likelihoods, Eq. 4
 BETA: float = 9.0            # weight of the KL divergence, Eq. 4
 BETA_WARM_UP: Share = 0.5    # share of the updates in which beta grows from 0; without it an axis can be lost
@@ -107,7 +107,7 @@ class LabelDecoders(nn.Module):
 # -------- Eq. 3 and 4, and the first loop of Alg. 1 (the state decoder p_theta(tau | z) is common.Decoder)
 
 def log_normal(x, mean, log_var):
-    """log N(x; mean, exp(log_var)), elementwise. The trap: torch's gaussian_nll_loss bounds the variance."""
+    """log N(x; mean, exp(log_var)), elementwise; torch's gaussian_nll_loss would clamp small variances."""
     return -0.5 * ((x - mean) ** 2 * torch.exp(-log_var) + log_var + math.log(2 * math.pi))
 
 
@@ -115,13 +115,13 @@ def objective(encoder, decoder, label_decoders, x, one_hot, y):
     """The three terms of Eq. 3 and 4: sums over time, dimensions and labels, means over the batch.
     x (B, T, x_dim) displacements; the labels as one_hot (B, y_dim), side by side, and as classes y (B, M)."""
     mean, log_var = encoder(x, one_hot)
-    z = mean + torch.randn_like(mean) * (0.5 * log_var).exp()  # z ~ q(z | tau, y)
+    z = mean + torch.randn_like(mean) * (0.5 * log_var).exp()  # z ~ q(z | tau, y): "latents" of Decoder
     # sum_t log p(s_t | s_1:t-1, z); in place of s_1:t-1 the decoder reads its own means
-    states = log_normal(x, *decoder.decode_latents(z, x.shape[1])).sum((1, 2)).mean()
+    log_p_tau = log_normal(x, *decoder.decode_latents(z, x.shape[1])).sum((1, 2)).mean()
     logits = label_decoders(z)
-    labels = -sum(F.cross_entropy(logits[m], y[:, m]) for m in range(len(logits)))  # sum_m log p(y^m | z)
+    log_p_y = -sum(F.cross_entropy(logits[m], y[:, m]) for m in range(len(logits)))  # sum_m log p(y^m | z)
     kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1).mean()  # D_KL(q(z | tau, y) || N(0, I))
-    return states, labels, kl
+    return log_p_tau, log_p_y, kl
 
 
 def supervision(dataset, hyper):
@@ -143,27 +143,26 @@ def supervision(dataset, hyper):
 def train(x, one_hot, y, names, hyper):
     """Alg. 1, "WET-VAE training". x, one_hot, y: see supervision. names of the M factors. hyper: the model's
     hyperparameters, one for each constant from DATA to Z_RANGE. Returns encoder and decoder."""
-    labels = names if hyper.labelled else []
     encoder = Encoder(x.shape[2], one_hot.shape[1], len(names), hyper.hidden)
     decoder = Decoder(len(names), x.shape[2], hyper.hidden)
-    label_decoders = LabelDecoders(labels, len(names), hyper.hidden, hyper.own_axis)
+    label_decoders = LabelDecoders(names if hyper.labelled else [], len(names), hyper.hidden, hyper.own_axis)
     networks = nn.ModuleList([encoder, decoder, label_decoders])
     optimizer = torch.optim.Adam(networks.parameters(), fused=True)
-    updates = len(x) // hyper.batch  # of an epoch
+    updates = len(x) // hyper.batch  # of an epoch; the few trajectories left are skipped
     for epoch in range(hyper.epochs):
         for i, rows in enumerate(torch.randperm(len(x)).split(hyper.batch)[:updates]):  # Alg. 1: B ~ D
-            states, labels, kl = objective(*networks, x[rows], one_hot[rows], y[rows])
+            log_p_tau, log_p_y, kl = objective(*networks, x[rows], one_hot[rows], y[rows])
             progress = (epoch + i / updates) / hyper.epochs
             beta = hyper.beta
             if progress < hyper.beta_warm_up:
                 beta *= progress / hyper.beta_warm_up
-            loss = -(states + hyper.gamma * labels - beta * kl)  # Eq. 4
+            loss = -(log_p_tau + hyper.gamma * log_p_y - beta * kl)  # Eq. 4
             optimizer.param_groups[0]["lr"] = hyper.learning_rate * (1 - progress)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
         if epoch % 4 == 3 or epoch + 1 == hyper.epochs:
-            print(f"{epoch + 1:3d}/{hyper.epochs}  log p(tau|z) {states:7.3f}  log p(y|z) {labels:7.3f}  "
+            print(f"{epoch + 1:3d}/{hyper.epochs}  log p(tau|z) {log_p_tau:7.3f}  log p(y|z) {log_p_y:7.3f}  "
                   f"KL {kl:6.3f}", flush=True)
     return encoder, decoder
 
@@ -188,17 +187,18 @@ def check_factors(decoder, names, steps):
 
 @torch.no_grad()
 def find_relation(decoder, names, steps, z_range):
-    """Alg. 1, "Test: find relation functions": for each factor of z_multi the weight with which single steps
-    and the relation function (common.next_skill) come nearest to the decoder's free run of `steps` (RMS, as
-    a share of the RMS step), over a grid from -z_range to z_range. Returns {factor: weight}."""
+    """Alg. 1, "Test: find relation functions", from the decoder alone (the paper: by hand, after the policy).
+    For each factor of z_multi: the weight with which a chain of single steps (common.next_skill) is nearest
+    to the free run, the decoder's `steps` transitions for the whole z, over a grid from -z_range to z_range.
+    The error: RMS difference / RMS displacement. Returns {factor: weight}."""
     grid, relation = torch.linspace(-z_range, z_range, 13), {}
     for factor in [name for name in names if MULTI.get(name) in names]:
         z = torch.zeros(len(grid) ** 2, len(names))  # direction 0: a turn stays within the data's directions
         z[:, [0, names.index(factor)]] = torch.cartesian_prod(grid, grid)  # the first axis is the speed
         free_run, errors = decoder(z, steps)[0], {}
         for weight in sorted(np.linspace(-1, 1, 401).round(4).tolist(), key=abs):  # small ones win ties
-            skills = SimpleNamespace(method="wedis", decoder=decoder, names=names, relation={factor: weight})
-            chain = commands_of(skills, z, steps)
+            policy = SimpleNamespace(method="wedis", decoder=decoder, names=names, relation={factor: weight})
+            chain = commands_of(policy, z, steps)
             errors[weight] = ((chain - free_run).square().mean() / free_run.square().mean()).sqrt().item()
         best = relation[factor] = min(errors, key=errors.get)
         print(f"relation function of {factor}: weight {best:+.3f}, {errors[best]:.1%} from the decoder's "

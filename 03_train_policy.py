@@ -2,7 +2,7 @@
 
 In: wetvae_<DECODER>_seed<n>.pt of stage 2. The command c of a skill z_single is the decoder's first
 displacement. The reward is the decoder's log-likelihood of the step that the robot makes (Eq. 6).
-Out: runs/policy_<experiment>_seed<seed>.pt, Fig 5 (15, 16) and a row of runs/results/policies.csv.
+Out: runs/policy_<experiment>_seed<n>.pt, Fig 5 (15, 16) and a row of runs/results/policies.csv.
 Takes 12 to 16 minutes on two cores (135 to 112 updates/s). Expect, mean of 3 seeds: tracking error 0.14
 in open loop, 0.04 in closed loop; there, median following error 0.06 m, and 1 % of the robots turn over.
 """
@@ -30,7 +30,7 @@ THREADS: Count = 2            # CPU threads; 1: updates wait for the robots' ste
 DECODER: str = "main"         # model of 02 whose decoder is the reward
 ROBOT: str = "ant"            # ant or half_cheetah
 STEP_SCALE: Positive = 0.1    # metres per trajectory unit, App. A.1.3: 1/10, Half-Cheetah 1/5
-VARIANCE_SCALE: Positive = 0.003  # decoder variance -> square metres (the paper: 0.05, and fast skills lag)
+VARIANCE_SCALE: Positive = 0.003  # decoder variance -> square metres (the paper: 0.05; fast skills then lag)
 BASE_FRAME: bool = True       # networks read state and command in the base frame (the paper: false)
 
 UPDATES: Count = 100_000      # updates of the critics (the paper: 1,920,000)
@@ -49,9 +49,9 @@ ACTOR_EVERY: Count = 2        # updates of the critics for each of actor and val
 DISCOUNT: Share = 0.98        # gamma of Eq. 1 (the paper: 0.99): a shorter horizon teaches to follow sooner
 SMOOTHING: Share = 0.01       # of the target value network, App. A.1.3
 REWARD_SCALE: float = 0.1     # of Eq. 6 (the paper: 1)
-TEMPERATURE: float = 0.003    # alpha, weight of the entropy (the paper: 0.01; at our reward scale 0.001)
-FLOOR_START: float = 0.04     # metres, least standard deviation in the reward; if small, robots stand still
-FLOOR_END: float = 0.01       # what it shrinks to, geometrically: slow skills are learnt (the paper: 0)
+TEMPERATURE: float = 0.003    # alpha, weight of the entropy (the paper: 0.01, that is 0.001 at our scale)
+FLOOR_START: float = 0.04     # metres, least deviation in the reward; started at 0.01, robots stand still
+FLOOR_END: float = 0.01       # its end, reached geometrically: now slow skills are learnt (the paper: 0)
 
 # Baselines only
 METHOD: str = "wedis"         # wedis, or a baseline: dads or sectar
@@ -92,24 +92,24 @@ MAY_DIFFER = (  # between a policy, or a checkpoint, and the run that uses it
 
 # -------- Eq. 6 and Algorithm 1, policy training
 
-def reward(mean, log_var, displacement, floor):
-    """log p_theta(s_t+1 | s_t, z) of Eq. 6, (B,), without its normaliser, which depends on the skill alone;
-    the entropy of Eq. 6 is in Sac.update. mean, log_var (B, 2 or 1) of the decoder: trajectory units;
-    displacement (B, 2 or 1), floor: metres. At the end of the Ant's training four fifths of the deviations
-    are on the floor of 1 cm: the reward is then nearly -|displacement - command|^2 / (2 floor^2)."""
+def reward(c, log_var, displacement, floor):
+    """REWARD_SCALE * log p_theta(s_t+1 | s_t, z), Eq. 6, (B,), less its normaliser, which no action changes;
+    the entropy of Eq. 6 is in Sac.update. c: command, log_var of the decoder, (B, 2 or 1), trajectory units;
+    displacement (B, 2 or 1), floor: metres. At the end of the Ant's training four fifths of the standard
+    deviations are on the floor, 1 cm: r = -REWARD_SCALE |displacement - STEP_SCALE c|^2 / (2 floor^2)."""
     variance = (VARIANCE_SCALE * log_var.exp()).clamp(min=floor ** 2)
-    return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * mean) ** 2 / variance).sum(1)
+    return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * c) ** 2 / variance).sum(1)
 
 
 def random_corrections(n, x_dim):
-    """Changes of a command as the closed loop makes them, (n, x_dim): 0, but with probability CORRECTED
-    uniform in a disc of radius common.CORRECTION."""
+    """Random corrections of commands, (n, x_dim): 0, but with probability CORRECTED uniform in a disc of
+    radius common.CORRECTION (in one dimension: as long as the points of a disc, with either sign)."""
     length = common.CORRECTION * torch.rand(n, 1).sqrt() * (torch.rand(n, 1) < CORRECTED)
     return length * nn.functional.normalize(torch.randn(n, x_dim))
 
 
 def train_wedis(decoder, names):
-    """Alg. 1, the second loop: a policy that follows the decoder's single steps. names: of the axes of z.
+    """Alg. 1, the second loop: a policy that follows single steps of the decoder, which `load` has frozen.
     Returns the policy. Shapes beside the lines: the Ant, n = ROBOTS, B = UPDATES_PER_STEP * BATCH = 2048."""
     x_dim, m1 = decoder.x_dim, sum(name in SINGLE for name in names)
     m2 = len(names) - m1
@@ -128,11 +128,11 @@ def train_wedis(decoder, names):
         z_single = torch.where(over, torch.randn(ROBOTS, m1), z_single)              # (n, 2)
         z = torch.cat([z_single, torch.zeros(ROBOTS, m2)], 1)                        # (n, 3)
         mean, _ = decoder(z, 1)                                                      # (n, 1, 2)
-        command = mean[:, 0] + correction                                            # (n, 2)
+        c = mean[:, 0] + correction                                                  # (n, 2), the command
 
-        # Alg. 1: execute actions a ~ pi(a | s, z_single). The second core steps the robots from here on
+        # Alg. 1: execute actions a ~ pi(a | s, z_single), here pi(a | s, c); a second core steps the robots
         s = robots.observe()                                                         # (n, 27)
-        a = sac.actor.act(s, command)                                                # (n, 8)
+        a = sac.actor.act(s, c)                                                      # (n, 8)
         if replay.added < WARM_UP:
             a = torch.rand(a.shape) * 2 - 1
         physics = submit(a)
@@ -151,11 +151,11 @@ def train_wedis(decoder, names):
             r = reward(c, log_var, batch.displacement, floor)                        # (B,)
             on_floor = (VARIANCE_SCALE * log_var.exp() < floor ** 2).float().mean()
 
-            # Alg. 1: optimize psi and the critics with the SAC, BATCH steps at a time
+            # Alg. 1: optimize psi and the critics with the SAC, BATCH steps at a time. c twice: no skill ends
             losses = sac.learn(batch, c, c, r)
             log.numbers = losses | dict(reward=r.mean(), on_floor=on_floor)
 
-        # Alg. 1: collect the samples in the replay buffer R
+        # Alg. 1: collect the samples in the replay buffer R (after the updates: both ran side by side)
         displacement, unstable = physics.result()
         replay.add(unstable, s=s, a=a, s2=robots.observe(), displacement=displacement, z_single=z_single,
                    correction=correction)
@@ -167,7 +167,7 @@ def train_wedis(decoder, names):
 # -------- SAC (Haarnoja et al. 2017), App. A.1.3
 
 class Sac(nn.Module):
-    """Actor psi, twin critics, value and target network, with a fixed temperature."""
+    """Actor psi, twin critics (psi bar), value (psi hat) and target network, with a fixed temperature."""
 
     def __init__(self, s_dim, c_dim, a_dim):
         super().__init__()
@@ -181,7 +181,7 @@ class Sac(nn.Module):
         self.updates, self.losses = 0, {}
 
     def normalise(self, s):
-        """Fix the mean and deviation of the state, from random steps s (N, s_dim)."""
+        """Fix the mean and deviation of the state, once, from random steps s (N, s_dim)."""
         x = self.actor.inputs(s, torch.zeros(len(s), self.actor.arguments[1]))[:, :len(self.actor.s_mean)]
         self.actor.s_mean.copy_(x.mean(0))
         self.actor.s_std.copy_(x.std(0, correction=0).clamp(min=1e-3))
@@ -229,7 +229,7 @@ class Sac(nn.Module):
 
 def main():
     config, _ = common.parse_flags(globals())
-    torch.set_num_threads(1)
+    torch.set_num_threads(1)  # for the networks; the other of THREADS steps the robots
     source = common.load(OUT, "wetvae", DECODER, SEED)
     check(source)
     if TRAIN:
@@ -413,9 +413,9 @@ class Log:
 
 def train_dads(_decoder, _names):
     """Sharma et al. 2019: skills z ~ U(-1, 1)^2. The reward is the mutual information of step and z under the
-    skill dynamics q(displacement | z), learnt at the same time: a Gaussian (theirs: a mixture of four) of
-    deviation 1 in units of the root mean square of recent displacements, as in their code: a learnt deviation
-    rewards standing still. In the base frame z is turned as if it were a displacement."""
+    skill dynamics q(displacement | z) (theirs: q(s' | s, z), a mixture of four Gaussians), learnt at the
+    same time: one Gaussian of deviation 1 in units of the root mean square of recent displacements. As in
+    their code the deviation is not learnt: that would reward standing still."""
     robots, rng, submit = start_robots()
     s_dim, a_dim = robots.observe().shape[1], robots.ctrl.shape[1]
     sac, replay = Sac(s_dim, Z_DIM, a_dim), Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=2, z=Z_DIM)
@@ -438,7 +438,7 @@ def train_dads(_decoder, _names):
             recent = replay.latest(RECENT).displacement
             log.policy.scale = recent.square().mean().sqrt().clamp(min=1e-4).item()  # the unit, metres a step
             for _ in range(MODEL_UPDATES):
-                batch = replay.sample(MODEL_BATCH, RECENT)  # relabelled steps would say nothing about z
+                batch = replay.sample(MODEL_BATCH, RECENT)  # each step with the skill that made it
                 model_loss = -log_q(batch.displacement, batch.z).mean()
                 adam.zero_grad()
                 model_loss.backward()
@@ -487,8 +487,8 @@ def train_sectar(_decoder, _names):
             mean, log_var = vae["encoder"](x.flatten(1)).chunk(2, 1)  # theirs: a bidirectional LSTM
             kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1)
             sampled = mean + (0.5 * log_var).exp() * torch.randn_like(mean)
-            decoded, variance = vae["decoder"](sampled, SKILL_STEPS)
-            variance = variance.exp().clamp(min=(0.01 / STEP_SCALE) ** 2)  # 1 cm: a likelihood has no bound
+            decoded, log_var = vae["decoder"](sampled, SKILL_STEPS)
+            variance = log_var.exp().clamp(min=(0.01 / STEP_SCALE) ** 2)  # at least 1 cm: else no bound
             log_p = -0.5 * (variance.log() + (x - decoded) ** 2 / variance).sum((1, 2))
             model_loss = (kl - log_p).mean()
             adam.zero_grad()
@@ -497,7 +497,7 @@ def train_sectar(_decoder, _names):
             batch = replay.trajectories(max(1, UPDATES_PER_STEP * BATCH // SKILL_STEPS), REPLAY)
             with torch.no_grad():
                 c = vae["decoder"](batch.z[:, 0], SKILL_STEPS)[0]
-            # Laplace likelihood of the end. The trap: that of steps is highest for standing still
+            # The end's Laplace likelihood, -|sum of errors|, in shares; the steps' own favours standing still
             error = batch.displacement / STEP_SCALE - c
             r = -REWARD_SCALE * (error * nn.functional.normalize(error.sum(1))[:, None]).sum(2)
             c2 = torch.cat([c[:, 1:], c[:, -1:]], 1)

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import cycle, product
 from pathlib import Path
+from timeit import timeit
 from types import SimpleNamespace
 
 import common  # before mujoco: it chooses how mujoco renders
@@ -18,6 +19,8 @@ from common import BLUE, GREY, RED, Count, Signed, commands_of, convert, execute
 import mujoco
 import numpy as np
 import torch
+
+from extras import render
 
 EXPERIMENT: str = "mazes"  # row of EXPERIMENTS below
 SEED: int = 0             # random seed of the trials
@@ -31,8 +34,8 @@ PORT: int = 8080          # of the page, on this machine alone; 0: the first fre
 METHOD: str = "wedis"     # rows of METHODS below
 MAZES: str = "maze1 maze2"  # rows of MAZE below
 REWARDS: str = "dense sparse"  # Sec. 6.2
-# printed: the planner predicts the decoder's T free steps; actions are sampled, in open loop (Algorithm 2).
-# commands: it predicts what the robot is commanded. closed: and feedback, and mean actions. Both are ours.
+# printed: planned with the decoder's T free steps; executed by sampled actions, no feedback within a skill.
+# commands: planned with what the robot is commanded. closed: as commands, with feedback and mean actions.
 MODES: str = "printed commands closed"  # one or more of the three
 POLICY: str = "ant_semi"  # experiment of 03
 POLICY_SEEDS: tuple[int, ...] = (0,)  # and its seeds
@@ -46,10 +49,10 @@ PLANNED: Count = 3        # H_P, skills planned ahead, dense reward; sparse: to 
 Z_RANGE: float = 1.5      # skills ~ U(-Z_RANGE, Z_RANGE), but speed ~ U(0, Z_RANGE)
 
 # Planning, App. A.1.4
-SAMPLES: tuple[Count, ...] = (10_000,)  # N, sequences of skills per plan; one or more numbers
+SAMPLES: tuple[Count, ...] = (10_000,)  # N, random sequences of which a plan is the best; one or more numbers
 LOOK_AHEAD: tuple[int, ...] = (0,)  # environment steps to plan ahead, one or more numbers (0: Table 2's H_P)
 POOL: Count = 65536       # skills, decoded once, that plans draw from (the paper: no pool)
-PENALTY: float = 100.0    # w_p, for each transition of a plan that collides
+PENALTY: float = 100.0    # w_p, for each transition of a sequence that collides
 REWARD_WEIGHT: float = 5.0  # w_r, sparse reward
 EPSILON: float = 5.0      # epsilon, metres: acceptable error; who ends nearer succeeds
 RADIUS: float = 1.0       # metres by which the planner grows the walls: the Ant's legs (the paper: 0)
@@ -87,12 +90,12 @@ METHODS = {  # Table 2
                       SAMPLES=(10, 100, 1000)),  # its sparse plans have 600 transitions: 0.4 s at 10,000
     "dads": DADS,
     "dads_speed": DADS | dict(EPISODE=255, HOLD=17),  # a skill as long as one of WEDIS's transitions, 2.7 m
-    "sectar": dict(MODES="printed", POLICY="ant_sectar", POLICY_SEEDS=(0, 1), HOLD=1, LENGTH=40, PLANNED=4,
+    "sectar": dict(MODES="printed", POLICY="ant_sectar", POLICY_SEEDS=(0,), HOLD=1, LENGTH=40, PLANNED=4,
                    SAMPLES=(10, 100, 1000)),
 }
 
-# -------- Algorithm 2, Sec. 5; its lines are counted from "for i"
-# c is a Configuration (below): one method, mode, maze, reward, N and policy, and the constants in lower case.
+# -------- Algorithm 2, Sec. 5; its lines are counted from "for i", each "end" is one
+# c: a Configuration (below), the constants of one run in lower case. In common.py c is a command instead.
 
 def plan_and_execute(c, policy, pool):
     """Algorithm 2 for c.trials robots side by side. Returns their poses (H_E + 1, trials, nq), and for each i
@@ -104,11 +107,11 @@ def plan_and_execute(c, policy, pool):
     closed = c.mode == "closed"
     skills = c.episode // (c.hold * c.length)
     poses, plans = [robots.qpos.copy()[None]], []
-    for i in range(skills):  # line 1
+    for i in range(skills):  # line 1; pool: the skills of skill_pool
         horizon = min(c.planned, skills - i)  # a departure: no plan looks beyond the end of the episode
         best = [plan(c, policy, pool, horizon, s0) for s0 in robots.place()]  # lines 2 to 11
         z, paths = map(torch.stack, zip(*best))
-        commands = commands_of(policy, z, c.length)  # lines 12, 17 and 18, for all t at once
+        commands = commands_of(policy, z, c.length)  # in all modes; lines 12, 17 and 18 for all t
         poses.append(execute(policy, robots, commands, c.hold, closed, deterministic=closed))  # 13 to 16, 19
         plans.append((z, paths))  # line 20, s_0 of the next round, is where the robots are now
     return np.concatenate(poses), plans
@@ -122,13 +125,14 @@ def plan(c, policy, pool, horizon, s0):
     picked = torch.randint(len(z), (c.samples, horizon))  # line 3
     path = [state]
     for j in range(horizon):  # line 4
-        delta_j = delta[picked[:, j]]  # lines 5 and 6: (N, T, 2)
-        path.append(scaled_path(state, delta_j, policy.scale * c.hold))  # line 7
+        delta_j = delta[picked[:, j]]  # lines 5 and 6, decoded once, in skill_pool: (N, T, 2)
+        # Trajectory scaling, Fig 3, in metres. The paper prints s_0 where the planned state must stand
+        path.append(state + policy.scale * c.hold * delta_j.cumsum(1))  # line 7
         state = path[-1][:, -1:]  # line 8
     path = torch.cat(path, 1)
-    # Sparse rewards are equal for all plans that end within epsilon: argmax takes the first of them.
+    # Sparse rewards are equal for all sequences that end within epsilon: argmax takes the first of them
     best = planning_reward(path, c).argmax()  # lines 10 and 11
-    return z[picked[best, 0]], path[best].clone()  # the trap: a view would keep all N paths in memory
+    return z[picked[best, 0]], path[best].clone()  # a copy: a view would keep all N paths in memory
 
 
 def skill_pool(c, policy):
@@ -149,15 +153,9 @@ def skill_pool(c, policy):
     return z, torch.cat(delta)
 
 
-def scaled_path(state, delta, scale):
-    """Trajectory scaling, Fig 3: displacements (N, T, 2) after states (N, 1, 2) -> the T states, metres.
-    scale: H_z times a trajectory unit's metres. The paper prints s_0 where the planned state must stand."""
-    return state + scale * delta.cumsum(1)
-
-
 def planning_reward(path, c):
-    """r_d or r_s, Sec. 6.2, of paths (N, K + 1, 2), metres -> (N,): the task reward of the last state less
-    w_p for each transition that collides."""
+    """r_d or r_s, Sec. 6.2, of paths (N, K + 1, 2), metres -> (N,): the task reward of the last state (our
+    choice: the paper does not say which states count) less w_p for each transition that collides."""
     distance = (path[:, -1] - torch.tensor(c.goal)).norm(dim=1)  # -r(s)
     penalty = c.penalty * collides(path, c.walls, c.radius).sum(1)
     if c.reward == "sparse":
@@ -175,7 +173,7 @@ def main():
         (c, policy, _), pool = runs[0], skill_pool(*runs[0][:2])
         return drive(c, policy, maze_spec(c), lambda s0: plan(c, policy, pool, c.planned, s0), SECONDS, PORT)
     table, start = Path(OUT) / "results" / f"{EXPERIMENT}.csv", time.time()
-    done, examples, pools = set(), [], {}
+    done, examples, pools = set(), {}, {}
     if table.exists() and set(DRAW.split()) <= {"fig06", "fig07", "fig14"}:  # others need the paths
         done = {row.get("settings") for row in common.read_csv(table)}
     for c, policy, settings in runs:
@@ -188,11 +186,13 @@ def main():
         poses, plans = plan_and_execute(c, policy, pools[key])
         if not examples:
             follow_one_skill(c, policy, poses, *plans[0])
-        examples.append((c, poses[:, 0], [paths[0].numpy() for _, paths in plans]))  # trial 0
+        examples.setdefault((c.maze, c.method, c.mode, c.reward),  # trial 0 of the first policy and N
+                            (c, poses[:, 0], [paths[0].numpy() for _, paths in plans]))
         distances = np.linalg.norm(poses[-1, :, :2] - c.goal, axis=1)
+        seconds = timeit(partial(plan, c, policy, pools[key], c.planned, torch.zeros(2)), number=3) / 3
         row = dict(maze=c.maze, reward=c.reward, method=c.method, mode=c.mode,
                    look_ahead=c.planned * c.hold * c.length, samples=c.samples, seed=c.seed,
-                   planning_ms=planning_ms(c, policy, pools[key]), policy_seed=c.policy_seed,
+                   planning_ms=1e3 * seconds, policy_seed=c.policy_seed,
                    policy=policy.sha256[:8], settings=settings)
         common.update_csv(table, [row | dict(trial=n, final_distance=d, success=int(d < c.epsilon))
                                  for n, d in enumerate(distances)], ("settings", "trial"))
@@ -348,14 +348,6 @@ def collides(path, walls, radius):
 
 # -------- measuring
 
-def planning_ms(c, policy, pool):
-    """Milliseconds of one plan of c.planned skills."""
-    clock = time.perf_counter()
-    for _ in range(3):
-        plan(c, policy, pool, c.planned, torch.zeros(2))
-    return 1e3 * (time.perf_counter() - clock) / 3
-
-
 def follow_one_skill(c, policy, poses, z, paths):
     """Print the first plan's skill of trial 0, its predicted and its executed end."""
     predicted, executed = paths[0, c.length].numpy(), poses[c.hold * c.length, 0, :2]
@@ -395,7 +387,7 @@ def print_table(rows):
         print(line, *cells, sep=" | ")
 
 
-# -------- drawing: rows, configurations, and (configuration, poses, paths of the plans) of each trial 0
+# -------- drawing; examples: {(maze, method, mode, reward): (configuration, poses, paths of the plans)}
 
 def draw_maze(ax, c, text, marker):
     for x0, x1, y0, y1 in c.walls:
@@ -407,7 +399,7 @@ def draw_maze(ax, c, text, marker):
 
 def draw_fig03(rows, configurations, examples):
     """Fig 3: trajectory scaling, on the first plan: the same shape, H_z times as large, and executed."""
-    c, poses, paths = examples[0]
+    c, poses, paths = next(iter(examples.values()))
     path = paths[0] - paths[0][0]
     figure, axes = plt.subplots(1, 2, figsize=(8, 3.2))
     for ax, scale, text in zip(axes, (1 / c.hold, 1), ("predicted", f"scaled by $H_z$ = {c.hold}")):
@@ -429,13 +421,15 @@ def draw_fig06(rows, configurations, examples):
 
 
 def draw_fig07(rows, configurations, examples):
-    """Fig 7: mean final distance against N, with its 95 % interval over policies and trials."""
-    panels = dict.fromkeys((c.maze, c.reward) for c in configurations)
+    """Fig 7: mean final distance against N, with its 95 % interval over policies and trials; dashed: the
+    goal's distance from the origin."""
+    panels = {(c.maze, c.reward): np.hypot(*c.goal) for c in configurations}
     okabe_ito = cycle([BLUE, RED, "#009E73", "#E69F00", "#CC79A7", "#56B4E9"])
     colours = dict(zip(dict.fromkeys(c.method for c in configurations), okabe_ito))
     marks, rng = dict(printed="o-", commands="s--", closed="^:"), np.random.default_rng(0)
     figure, axes = plt.subplots(1, len(panels), figsize=(3.6 * len(panels), 4), sharey=True, squeeze=False)
-    for ax, (maze, reward) in zip(axes[0], panels):
+    for ax, ((maze, reward), distance) in zip(axes[0], panels.items()):
+        ax.axhline(distance, ls="--", color=GREY)
         for method, mode in dict.fromkeys((c.method, c.mode) for c in configurations):
             found, where = {}, dict(maze=maze, reward=reward, method=method, mode=mode)
             for samples in sorted({c.samples for c in configurations}):
@@ -454,11 +448,10 @@ def draw_fig07(rows, configurations, examples):
 
 def draw_examples(name, reward, rows, configurations, examples):
     """Fig 8, 17, 18: planned and executed paths, a row per maze and method, a column per mode."""
-    shown = {(c.maze, c.method, c.mode): (c, poses, paths) for c, poses, paths in examples[::-1]
-             if c.reward == reward}  # of each the first policy and N
+    shown = {key[:3]: example for key, example in examples.items() if key[3] == reward}
     if not shown:
         return print(f"no {name}: no trial has the {reward} reward")
-    lines, modes = {key[:2]: None for key in reversed(shown)}, {key[2]: None for key in reversed(shown)}
+    lines, modes = dict.fromkeys(key[:2] for key in shown), dict.fromkeys(key[2] for key in shown)
     figure, axes = plt.subplots(len(lines), len(modes), squeeze=False,
                                 figsize=(3.6 * len(modes), 3 * len(lines)))
     for ax, (line, mode) in zip(axes.flat, product(lines, modes)):
@@ -475,14 +468,8 @@ def draw_examples(name, reward, rows, configurations, examples):
     common.save_figure(figure, OUT, name)
 
 
-def rendered(rows, configurations, examples, name):
-    """Fig 14, the robots, and a GIF per maze: pictures of MuJoCo's renderer."""
-    from extras import render
-    render.draw(name, maze_spec, examples, OUT)
-
-
-DRAWINGS = dict(fig03=draw_fig03, fig06=draw_fig06, fig07=draw_fig07, fig14=partial(rendered, name="fig14"),
-                gif=partial(rendered, name="gif"),
+DRAWINGS = dict(fig03=draw_fig03, fig06=draw_fig06, fig07=draw_fig07, fig14=lambda *_: render.fig14(OUT),
+                gif=lambda _, __, examples: render.gif(maze_spec, examples, OUT),
                 fig08=partial(draw_examples, "fig08_mpc_examples", "sparse"),
                 fig17=partial(draw_examples, "fig17_more_examples", "dense"),
                 fig18=partial(draw_examples, "fig18_s_maze_obstacles", "dense"))

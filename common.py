@@ -42,8 +42,8 @@ SINGLE = ("speed", "direction")  # factors of z_single, Sec. 4.2.2
 MULTI = dict(curvature="direction", acceleration="speed")  # factors of z_multi, and what they change in time
 CLASSES = dict(speed=4, direction=4, curvature=3, acceleration=3, x=4, y=4)  # of labels, App. A.1.1, A.3.1
 FRAME_SKIP: Count = 5     # physics steps of 0.01 s per environment step
-FEEDBACK: Share = 0.1     # closed loop: share of the distance to the reference that commands gain (paper: 0)
-CORRECTION: float = 0.2   # closed loop: the longest such gain, trajectory units
+FEEDBACK: Share = 0.1     # closed loop: share of (reference - place) added to a command (the paper: 0)
+CORRECTION: float = 0.2   # closed loop: the most that is added, trajectory units
 FORMAT = 5                # of the artifacts; raise it when their meaning changes
 HERE = Path(__file__).resolve().parent
 SCRIPT = {"dataset": "01_make_dataset.py", "wetvae": "02_train_wetvae.py", "policy": "03_train_policy.py"}
@@ -57,7 +57,7 @@ def weak_labels(factors, names, ranges):
     labels = []
     for name in names:
         if name in MULTI:
-            labels.append(np.sign(factors[name]).astype(int) % 3)  # 0, 1, 2
+            labels.append(np.sign(factors[name]).astype(int) % 3)  # zero, left, right (A.1.1: right, left)
         else:
             labels.append(np.digitize(factors[name], np.linspace(*ranges[name], CLASSES[name] + 1)[1:-1]))
         if name == "direction":  # the paper's first class has the largest angles
@@ -69,7 +69,7 @@ def weak_labels(factors, names, ranges):
 
 class Decoder(nn.Module):
     """p_theta(tau | z), Fig 1: an LSTM over z and its own last mean -> a Gaussian over the next displacement.
-    The trap: a decoder that reads the true last displacement needs no z, and z stays entangled."""
+    If it read the true last displacement, it would need no z, and z would stay entangled."""
 
     def __init__(self, z_dim, x_dim, hidden):
         super().__init__()
@@ -101,11 +101,10 @@ def next_skill(z, names, relation):
     of the axes; relation {factor of z_multi: weight} (the paper: -0.2, -0.1 by hand, for its axes)."""
     z = z.clone()
     for factor, weight in relation.items():
-        change = weight * z[:, names.index(factor)]
-        changed = z[:, names.index(MULTI[factor])]  # a view: += below writes into z
+        i, change = names.index(MULTI[factor]), weight * z[:, names.index(factor)]
         if factor == "acceleration" and "direction" not in names:
-            change = change * changed.sign()  # f_speed of App. A.3.2: on a rail a speed has a sign
-        changed += change  # f_dir or f_speed
+            change = change * z[:, i].sign()  # f_speed of App. A.3.2: in one dimension a speed has a sign
+        z[:, i] += change  # f_dir or f_speed
     return z
 
 
@@ -118,11 +117,11 @@ def commands_of(policy, z, steps):
     if policy.method == "sectar":
         return policy.decoder(z, steps)[0]
     is_single = torch.tensor([float(name in SINGLE) for name in policy.names])
-    single_steps = []
+    singles = []
     for _ in range(steps):
-        single_steps.append(z * is_single)  # (z_single, 0)
+        singles.append(z * is_single)  # (z_single, 0)
         z = next_skill(z, policy.names, policy.relation)  # Alg. 2, lines 17 and 18
-    mean, _ = policy.decoder(torch.cat(single_steps), 1)
+    mean, _ = policy.decoder(torch.cat(singles), 1)
     return mean.view(steps, len(z), -1).transpose(0, 1)
 
 
@@ -183,12 +182,12 @@ def rotate(v, angle):
 
 
 def to_base_frame(s, c):
-    """State (B, 27) of Robots.observe and command (B, 2), turned by the torso's heading -> (B, 26), (B, 2).
+    """State (B, 27) of Robots.observe and command (B, 2), turned back by the heading -> (B, 26), (B, 2).
     The dynamics do not depend on the heading: what is learnt for one holds for all."""
-    half = torch.atan2(s[:, 4], s[:, 1])  # half the heading: (w, 0, 0, z) is a turn about the vertical
+    half = torch.atan2(s[:, 4], s[:, 1])  # half the heading, from w and z of the quaternion s[:, 1:5]
     upright = torch.hypot(s[:, 1], s[:, 4])[:, None]
     tilt, velocity = rotate(s[:, 2:4], -half), rotate(s[:, 13:15], -2 * half)
-    body = s[:, 5:13], velocity, s[:, 15:]  # the angular velocity is the torso's own already
+    body = s[:, 5:13], velocity, s[:, 15:]  # joints; velocity; the rest, which no heading changes
     return torch.cat([s[:, :1], upright, tilt, *body], 1), rotate(c, -2 * half)
 
 
@@ -237,16 +236,17 @@ class Actor(nn.Module):
 # -------- execution of skills, Alg. 2, lines 13 to 19
 
 def closed_loop(c, reference, robots, scale):
-    """Commands (n, 2 or 1), trajectory units: c and a share of reference - place, both in metres. Slow
-    commands gain up to twice that share, or slow skills would drift before they are corrected."""
+    """Commands (n, 2 or 1), trajectory units: c plus a share of reference - place (both in metres), up to
+    twice as large for slow commands, since slow skills would drift before they are corrected."""
     share = FEEDBACK * (2 - c.norm(dim=1, keepdim=True).clamp(max=1))
-    gain = share * (reference - robots.place()) / scale
-    return c + gain * (CORRECTION / gain.norm(dim=1, keepdim=True).clamp(min=CORRECTION or 1.0))
+    correction = share * (reference - robots.place()) / scale
+    size = correction.norm(dim=1, keepdim=True)
+    return c + correction * (CORRECTION / size.clamp(min=max(CORRECTION, 1e-9)))  # 0 switches it off
 
 
 def execute(policy, robots, commands, hold, closed, deterministic):
-    """Alg. 2, lines 13 to 19: hold each command (n, T, c_dim) for `hold` (H_z) steps. closed: closed loop, in
-    which a reference advances by the command. Returns the poses after each step, (T * hold, n, nq)."""
+    """Alg. 2, lines 13 to 16: hold each command (n, T, c_dim) for `hold` (H_z) steps; commands_of has 17, 18.
+    closed: a reference advances by the command. Returns the poses after each step, (T * hold, n, nq)."""
     reference, poses, ever_unstable = robots.place(), [], False
     for c in commands.unbind(1):
         for _ in range(hold):

@@ -9,20 +9,13 @@ import mujoco
 from PIL import Image, ImageDraw  # comes with matplotlib
 
 
-def draw(name, maze_spec, examples, out):
-    """name: fig14 or gif. maze_spec: makes the model of a configuration; examples: (configuration, poses, ..)
-    of each trial 0."""
-    if can_render():
-        draw_fig14(out) if name == "fig14" else draw_gif(maze_spec, examples, out)
-
-
-@cache  # the trap: where a first try fails, a second one ends the process
+@cache  # or a second try, after one that failed, would end the process
 def can_render():
     """Whether MuJoCo can draw off-screen. If not, says so once."""
     try:
         mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
     except Exception:  # its kind differs by platform
-        print("no Fig 14, no GIF: MuJoCo's renderer finds no GL library (install EGL or OSMesa)")
+        print("no Fig 14, no GIF: MuJoCo's renderer finds no GL library (on Linux: install EGL, libegl1)")
         return False
     return True
 
@@ -39,8 +32,10 @@ def render(model, poses, height, width):
     return pictures
 
 
-def draw_fig14(out):
+def fig14(out):
     """Fig 14: both robots."""
+    if not can_render():
+        return
     figure, axes = plt.subplots(1, 2, figsize=(8, 3.2))
     for ax, name in zip(axes, ("ant", "half_cheetah")):
         model = common.robot_spec(name).compile()
@@ -52,9 +47,13 @@ def draw_fig14(out):
     common.save_figure(figure, out, "fig14_robots")
 
 
-def draw_gif(maze_spec, examples, out):
-    """A GIF per maze: the last example with the first reward, so in the last mode."""
-    last = {c.maze: (c, poses) for c, poses, _ in examples if c.reward == examples[0][0].reward}
+def gif(maze_spec, examples, out):
+    """A GIF per maze: the last example with the first reward, so in the last mode. maze_spec(configuration):
+    the model; examples: those of 04."""
+    if not can_render():
+        return
+    first = next(iter(examples))[3]
+    last = {c.maze: (c, poses) for c, poses, _ in examples.values() if c.reward == first}
     for maze, (c, poses) in last.items():
         spec = maze_spec(c)
         for x, y in poses[::10, :2]:

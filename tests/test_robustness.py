@@ -128,7 +128,7 @@ def test_killed_three_times_it_ends_with_the_same_bits(fork, out):
     ("--seed 98", "python 02_train_wetvae.py --seed 98 --experiment main"),
     ("--smoothing -0.1", "a number from 0 to 1"), ("--discount 1", "below 1"), ("--relabelled 2", "a number from 0 to 1"),
     ("--step_scale 0", "a number above 0"), ("--single_run 1,2.5", "--single_run is '2.5', but must be a whole number"),
-    ("--skill_steps 7", "--skill_steps must divide --episode"),
+    ("--experiment ant_sectar --skill_steps 7", "--skill_steps must divide --episode"),
     ("--updates 0", "--updates"), ("--multi_run 5", "2 numbers")])
 def test_03_ends_in_one_line_before_training(flags, message, s3, inside, out, monkeypatch):
     monkeypatch.setattr(s3, "start_robots", lambda: pytest.fail("it trains"))
@@ -289,7 +289,7 @@ NO_NUMBER = {(S4, "POOL"): "no pool"}
 ONE_LINE = {  # values that are in range and rightly end in one line; of a learning rate also: with code 1
     (S1, "LENGTH"): [1], (S1, "DIRECTION"): [0], (S1, "CURVATURE"): [0], (S1, "SPEED_LOW"): [-1, 1], (S1, "STRAIGHT"): [1],
     (S1, "ACCELERATION"): [0], (S3, "DISCOUNT"): [1], (S4, "EPISODE"): [1],
-    (S2, "SEED"): [1], (S3, "SEED"): [1]}  # there is no such data set, or decoder
+    (S2, "SEED"): [1]}  # there is no such data set
 OFF = {  # constants that 0 switches off, whatever their declared types
     S1: "SPEED_LOW STRAIGHT", S2: "GAMMA BETA BETA_WARM_UP",
     S3: "RELABELLED CORRECTED DISCOUNT SMOOTHING REWARD_SCALE TEMPERATURE FLOOR_START FLOOR_END",
