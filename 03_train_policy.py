@@ -41,17 +41,22 @@ WARM_UP: Count = 10_000       # steps with random actions; their statistics norm
 REPLAY: Count = 1_000_000     # steps in the replay buffer R
 UPDATES_PER_STEP: Count = 8   # updates in each step of all robots
 BATCH: Count = 256            # App. A.1.3
+RELABELLED: Share = 0.5       # share of a batch that is relabelled with a fresh skill (the paper: 0)
 CORRECTED: Share = 0.25       # share of skills with a random correction, as in closed loop (the paper: 0)
 
 HIDDEN: Count = 256           # width of both hidden layers (the paper: 512; Half-Cheetah 256)
-LEARNING_RATE: Positive = 1e-3  # of Adam, falls linearly to 0 (the paper: 0.0003, fixed)
+LEARNING_RATE: Positive = 1e-3  # of Adam (the paper: 0.0003, fixed)
+DECAY_FROM: Share = 0.5       # share of the updates after which it falls linearly to 0 (the paper: 1)
 ACTOR_EVERY: Count = 2        # updates of the critics for each of actor and value network (the paper: 1)
+AVERAGED: Share = 0.002       # rate of the average of the actor's weights that is the policy (the paper: 1)
 DISCOUNT: Share = 0.98        # gamma of Eq. 1 (the paper: 0.99): a shorter horizon teaches to follow sooner
 SMOOTHING: Share = 0.01       # of the target value network, App. A.1.3
 REWARD_SCALE: float = 0.1     # of Eq. 6 (the paper: 1)
 TEMPERATURE: float = 0.003    # alpha, weight of the entropy (the paper: 0.01, that is 0.001 at our scale)
 FLOOR_START: float = 0.04     # metres, least deviation in the reward; started at 0.01, robots stand still
-FLOOR_END: float = 0.01       # its end, reached geometrically: now slow skills are learnt (the paper: 0)
+FLOOR_END: float = 0.01       # what it shrinks to, geometrically: now slow skills are learnt (the paper: 0)
+FLOOR_FROM: Share = 0.15      # share of the updates after which it shrinks
+FLOOR_UNTIL: Share = 0.6      # share of the updates at which it reaches FLOOR_END
 
 # Baselines only
 METHOD: str = "wedis"         # wedis, or a baseline: dads or sectar
@@ -60,7 +65,6 @@ RECENT: Count = 40_000        # latest steps that a baseline's model learns from
 MODEL_BATCH: Count = 256      # steps (DADS), trajectories (SeCTAR) in a batch
 MODEL_UPDATES: Count = 4      # DADS: updates of the skill dynamics in each step of all robots
 PRIOR_SAMPLES: Count = 100    # L of DADS's reward
-RELABELLED: Share = 0.5       # DADS: share of a batch that is judged by a fresh skill
 
 # Measuring only: never an obstacle to --resume
 REPORTS: Count = 20           # printed lines, points of the learning curve, and checkpoints
@@ -79,11 +83,11 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs
                          VARIANCE_SCALE=0.05, ROBOTS=64, SKILL_STEPS=100, CORRECTED=0.5, DISCOUNT=0.97,
                          Z_RANGE=1.0, MULTI_RUN=(6, 20), FIGURE="fig16_half_cheetah"),
     "ant_world_frame": dict(BASE_FRAME=False),  # the paper's frame
-    "ant_dads": dict(METHOD="dads", UPDATES=88_000, Z_RANGE=1.0, SKILL_STEPS=200, REWARD_SCALE=1.0,
-                     DISCOUNT=0.995, MULTI_RUN=(1, 200), FIGURE="fig05_skills_dads"),  # WEDIS's minutes
-    "ant_sectar": dict(METHOD="sectar", UPDATES=80_000, Z_DIM=8, SKILL_STEPS=50, RECENT=512_000,
+    "ant_dads": dict(METHOD="dads", Z_RANGE=1.0, SKILL_STEPS=200, REWARD_SCALE=1.0, DISCOUNT=0.995,
+                     MULTI_RUN=(1, 200), FIGURE="fig05_skills_dads"),
+    "ant_sectar": dict(METHOD="sectar", UPDATES=30_000, Z_DIM=8, SKILL_STEPS=50, RECENT=512_000,
                        MODEL_BATCH=128, REWARD_SCALE=1.0, SINGLE_RUN=(50, 1), MULTI_RUN=(50, 1),
-                       FIGURE="fig05_skills_sectar"),
+                       FIGURE="fig05_skills_sectar"),  # longer is worse
 }
 MAY_DIFFER = (  # between a policy, or a checkpoint, and the run that uses it
     "OUT TRAIN RESUME THREADS REPORTS UPDATES Z_RANGE SINGLE_RUN MULTI_RUN TRAVERSAL NOISY STARTS FIGURE "
@@ -140,13 +144,16 @@ def train_wedis(decoder, names):
         if replay.added >= WARM_UP:
             if sac.updates == 0:
                 sac.normalise(replay.read(slice(0, replay.added)).s)
-            # Alg. 1: sample a batch of transitions
+            # Alg. 1: sample a batch of transitions. Relabelling: any step can be judged by any skill
             batch = replay.sample(UPDATES_PER_STEP * BATCH)                          # (B, ..) each
-            z = torch.cat([batch.z_single, torch.zeros(len(batch.s), m2)], 1)        # (B, 3)
+            fresh = torch.rand(len(batch.s), 1) < RELABELLED                         # (B, 1)
+            batch.correction = torch.where(fresh, random_corrections(len(fresh), x_dim), batch.correction)
+            batch.z_single = torch.where(fresh, torch.randn(len(fresh), m1), batch.z_single)
+            z = torch.cat([batch.z_single, torch.zeros(len(fresh), m2)], 1)          # (B, 3)
 
             # Alg. 1: compute the reward r = log p_theta(s_t+1 | s_t, z), Eq. 6
             mean, log_var = (out[:, 0] for out in decoder(z, 1))                     # (B, 2) each
-            floor = FLOOR_START ** (1 - sac.updates / UPDATES) * FLOOR_END ** (sac.updates / UPDATES)
+            floor = floor_at(sac.updates / UPDATES)
             c = mean + batch.correction                                              # (B, 2)
             r = reward(c, log_var, batch.displacement, floor)                        # (B,)
             on_floor = (VARIANCE_SCALE * log_var.exp() < floor ** 2).float().mean()
@@ -164,10 +171,17 @@ def train_wedis(decoder, names):
     return log.policy
 
 
+def floor_at(progress):
+    """The least deviation in the reward, metres, when a share `progress` of the training is done."""
+    shrunk = min(1, max(0, (progress - FLOOR_FROM) / max(FLOOR_UNTIL - FLOOR_FROM, 1e-9)))
+    return FLOOR_START ** (1 - shrunk) * FLOOR_END ** shrunk
+
+
 # -------- SAC (Haarnoja et al. 2017), App. A.1.3
 
 class Sac(nn.Module):
-    """Actor psi, twin critics (psi bar), value (psi hat) and target network, with a fixed temperature."""
+    """Actor psi, twin critics (psi bar), value (psi hat) and target network, with a fixed temperature.
+    average: the policy, a running average of the actor's weights."""
 
     def __init__(self, s_dim, c_dim, a_dim):
         super().__init__()
@@ -176,6 +190,7 @@ class Sac(nn.Module):
         self.critics = nn.ModuleList(layers(n_in + a_dim, HIDDEN, 1) for _ in range(2))
         self.value = layers(n_in, HIDDEN, 1)
         self.target = copy.deepcopy(self.value).requires_grad_(False)
+        self.average = copy.deepcopy(self.actor).requires_grad_(False)
         self.critic_adam = torch.optim.Adam(self.critics.parameters(), fused=True)
         self.actor_adam = torch.optim.Adam([*self.actor.parameters(), *self.value.parameters()], fused=True)
         self.updates, self.losses = 0, {}
@@ -185,12 +200,14 @@ class Sac(nn.Module):
         x = self.actor.inputs(s, torch.zeros(len(s), self.actor.arguments[1]))[:, :len(self.actor.s_mean)]
         self.actor.s_mean.copy_(x.mean(0))
         self.actor.s_std.copy_(x.std(0, correction=0).clamp(min=1e-3))
+        self.average.load_state_dict(self.actor.state_dict())
 
     def learn(self, batch, c, c2, r):
         """Updates with the steps of batch, BATCH at a time. c, c2 (B, c_dim): commands before and after the
         step; r (B,): rewards. Returns the last losses."""
+        left = (1 - self.updates / UPDATES) / max(1 - DECAY_FROM, 1e-9)
         for group in self.critic_adam.param_groups + self.actor_adam.param_groups:
-            group["lr"] = LEARNING_RATE * (1 - self.updates / UPDATES)
+            group["lr"] = LEARNING_RATE * min(1, left)
         x, x2 = self.actor.inputs(batch.s, c), self.actor.inputs(batch.s2, c2)
         for part in zip(x.split(BATCH), batch.a.split(BATCH), x2.split(BATCH), r.split(BATCH)):
             self.update(*part)
@@ -222,6 +239,8 @@ class Sac(nn.Module):
         self.actor_adam.step()
         with torch.no_grad():
             torch._foreach_lerp_([*self.target.parameters()], [*self.value.parameters()], SMOOTHING)
+            rate = AVERAGED or 1.0  # 0 switches the average off
+            torch._foreach_lerp_([*self.average.net.parameters()], [*self.actor.net.parameters()], rate)
         self.losses |= dict(actor_loss=actor_loss.detach())
 
 
@@ -307,7 +326,7 @@ def start_robots():
 
 def make_policy(sac, decoder, names, scale):
     """What 04 needs of a policy, and what the reports measure."""
-    return SimpleNamespace(actor=sac.actor, decoder=decoder, names=names, scale=scale, method=METHOD,
+    return SimpleNamespace(actor=sac.average, decoder=decoder, names=names, scale=scale, method=METHOD,
                            robot=ROBOT, relation={}, updates=0, env_steps=0, seconds=0.0, curve=[])
 
 

@@ -139,20 +139,15 @@ def test_reward_is_equation_6_up_to_its_maximum(s3):
         torch.testing.assert_close(s3.reward(mean, log_var, displacement, floor), expected, **CLOSE)
 
 
-@pytest.mark.parametrize("start, end, wanted", [
-    (0.08, 0.005, np.geomspace(0.08, 0.005, 5)), (0.01, 0.01, [0.01] * 5), (0.0, 0.0, [0] * 5), (0.04, 0.0, [0.04, 0, 0, 0, 0]),
-    (0.0, 0.01, [0] * 5)])
-def test_the_floor_shrinks_geometrically_and_may_be_off(start, end, wanted, s3, monkeypatch):
-    """What the loop hands to the reward after 0, 1, 2, 3 quarters of a training, and where it would be at the end."""
-    vars(s3).update(ROBOTS=4, SKILL_STEPS=5, EPISODE=10, REPLAY=40, WARM_UP=0, UPDATES=8, HIDDEN=8, BATCH=4, UPDATES_PER_STEP=2,
-                    FLOOR_START=start, FLOOR_END=end, THREADS=1)
-    floors, reward = [], s3.reward
-    monkeypatch.setattr(s3, "reward", lambda *given: floors.append(given[3]) or reward(*given))
-    decoder = common.Decoder(3, 2, 8).requires_grad_(False)
-    for updates in (0, 2, 4, 6):
-        one_pass(s3, monkeypatch, lambda: s3.train_wedis(decoder, THREE), lambda replay: setattr(replay, "added", 20),
-                 lambda log, updates=updates: setattr(log.sac, "updates", updates))
-    assert floors == pytest.approx(list(wanted[:4]))
+def test_the_floor_shrinks_geometrically_and_may_be_off(s3):
+    vars(s3).update(FLOOR_START=0.08, FLOOR_END=0.02, FLOOR_FROM=0.2, FLOOR_UNTIL=0.6)
+    for progress, floor in ((0, 0.08), (0.2, 0.08), (0.4, 0.04), (0.6, 0.02), (1, 0.02)):
+        assert s3.floor_at(progress) == pytest.approx(floor)
+    for start, end, floors in ((0.0, 0.0, (0, 0, 0)), (0.04, 0.0, (0.04, 0, 0)), (0.0, 0.01, (0, 0, 0.01))):
+        vars(s3).update(FLOOR_START=start, FLOOR_END=end)
+        assert [s3.floor_at(progress) for progress in (0.1, 0.4, 0.9)] == pytest.approx(floors)
+    vars(s3).update(FLOOR_START=0.04, FLOOR_END=0.01, FLOOR_FROM=0.5, FLOOR_UNTIL=0.5)  # at once
+    assert [s3.floor_at(progress) for progress in (0.5, 0.51)] == pytest.approx([0.04, 0.01])
 
 
 @pytest.mark.parametrize("x_dim", [2, 1])
@@ -174,8 +169,9 @@ def small_sac(s3, every):
     torch.manual_seed(0)
     vars(s3).update(HIDDEN=32, TEMPERATURE=0.05, BASE_FRAME=False, ACTOR_EVERY=every, DISCOUNT=0.9)
     sac = s3.Sac(5, 2, 3)
-    for p in sac.target.parameters():
-        p.add_(0.1 * torch.randn_like(p))  # unlike the network that it follows
+    for one in (sac.target, sac.average):
+        for p in one.parameters():
+            p.add_(0.1 * torch.randn_like(p))  # unlike the networks that they follow
     batch = torch.randn(64, 7), torch.rand(64, 3) * 2 - 1, torch.randn(64, 7), torch.randn(64)
     return sac, batch
 
@@ -185,7 +181,7 @@ def test_one_update_of_sac_equals_a_plain_version(s3):
     sac, (x, a, x2, r) = small_sac(s3, 1)
     sac.critic_adam = torch.optim.SGD(sac.critics.parameters(), lr=1.0)
     sac.actor_adam = torch.optim.SGD([*sac.actor.parameters(), *sac.value.parameters()], lr=1.0)
-    plain, actor, value, target = map(s3.copy.deepcopy, (sac.critics, sac.actor, sac.value, sac.target))
+    plain, actor, value, target, average = map(s3.copy.deepcopy, (sac.critics, sac.actor, sac.value, sac.target, sac.average))
     torch.manual_seed(1)
     sac.update(x, a, x2, r)
 
@@ -209,13 +205,21 @@ def test_one_update_of_sac_equals_a_plain_version(s3):
     for ours, theirs in ((sac.critics, plain), (sac.actor, actor), (sac.value, value)):
         for p, wanted in zip(ours.parameters(), theirs.parameters()):
             torch.testing.assert_close(p, wanted, **CLOSE)
-    for after, old, followed in zip(*(net.parameters() for net in (sac.target, target, value))):
-        torch.testing.assert_close(after, (1 - s3.SMOOTHING) * old + s3.SMOOTHING * followed, **CLOSE)
+    for followed, before, ours, rate in ((sac.average, average, actor, s3.AVERAGED), (sac.target, target, value, s3.SMOOTHING)):
+        for after, old, wanted in zip(*(net.parameters() for net in (followed, before, ours))):
+            torch.testing.assert_close(after, (1 - rate) * old + rate * wanted, **CLOSE)
+
+
+def test_without_an_average_the_policy_is_the_actor(s3):
+    sac, batch = small_sac(s3, 1)
+    s3.AVERAGED = 0.0  # off
+    sac.update(*batch)
+    assert all(torch.equal(p, q) for p, q in zip(sac.average.parameters(), sac.actor.parameters()))
 
 
 def test_the_actor_waits_for_every_second_update_of_the_critics(s3):
     sac, (x, a, x2, r) = small_sac(s3, 2)
-    waiting = [sac.actor, sac.value, sac.target]
+    waiting = [sac.actor, sac.value, sac.target, sac.average]
 
     def changed(networks):
         before = [p.clone() for net in networks for p in net.parameters()]
@@ -225,13 +229,13 @@ def test_the_actor_waits_for_every_second_update_of_the_critics(s3):
     assert all(changed(waiting)) and not any(changed(waiting))
 
 
-def test_learn_takes_batches_and_its_rate_falls_to_zero(s3, monkeypatch):
+def test_learn_takes_batches_and_its_rate_falls_in_the_second_half(s3, monkeypatch):
     sac, _ = small_sac(s3, 1)
     vars(s3).update(UPDATES=1000, BATCH=24)
     taken, batch = [], SimpleNamespace(s=torch.randn(72, 5), a=torch.randn(72, 3), s2=torch.randn(72, 5))
     c, c2, r = torch.randn(72, 2), torch.randn(72, 2), torch.randn(72)
     monkeypatch.setattr(sac, "update", lambda *part: taken.append(part))
-    for progress, rate in ((0, 1), (0.25, 0.75), (0.5, 0.5), (0.75, 0.25), (1, 0)):
+    for progress, rate in ((0, 1), (0.25, 1), (0.5, 1), (0.75, 0.5), (1, 0)):
         sac.updates = int(1000 * progress)
         sac.learn(batch, c, c2, r)
         for optimizer in (sac.critic_adam, sac.actor_adam):
@@ -247,10 +251,10 @@ THREE = ["speed", "direction", "curvature"]
 
 
 def test_one_pass_of_alg_1_pays_equation_6(s3, monkeypatch):
-    """Stored steps, judged by torch.distributions; the commands before and after."""
+    """Stored steps, a share of them relabelled, judged by torch.distributions; the commands before and after."""
     torch.manual_seed(0)
     vars(s3).update(ROBOTS=4, SKILL_STEPS=5, EPISODE=10, REPLAY=400, WARM_UP=10, UPDATES=8, HIDDEN=16, BATCH=600,
-                    UPDATES_PER_STEP=2, CORRECTED=0.5, FLOOR_START=0.05, THREADS=1)
+                    UPDATES_PER_STEP=2, RELABELLED=0.4, CORRECTED=0.5, FLOOR_START=0.05, THREADS=1)
     decoder = common.Decoder(3, 2, 16).requires_grad_(False)
     decoder.head[2].weight *= 5
 
@@ -260,11 +264,16 @@ def test_one_pass_of_alg_1_pays_equation_6(s3, monkeypatch):
         replay.read(slice(0, 300)).displacement.mul_(0.05)
         replay.read(slice(0, 300)).correction.mul_(0.1)
     done = one_pass(s3, monkeypatch, lambda: s3.train_wedis(decoder, THREE), fill)
-    assert done.log.policy.actor is done.log.sac.actor  # the policy is the actor itself
     stored, batch, n = done.stored, done.batch, 1200
     rows = (batch.s[:, None, 0] == stored.s[:, 0]).int().argmax(1)  # which of the stored steps these are
-    for name in ("s", "a", "s2", "displacement", "z_single", "correction"):
+    for name in ("s", "a", "s2", "displacement"):
         assert torch.equal(vars(batch)[name], vars(stored)[name][rows])
+    own = (batch.z_single == stored.z_single[rows]).all(1)
+    assert own.float().mean().item() == pytest.approx(0.6, abs=0.05)
+    assert torch.equal(batch.correction[own], stored.correction[rows][own])
+    fresh = batch.correction[~own].norm(dim=1)
+    assert fresh.max() <= common.CORRECTION + 1e-6 and (fresh > 0).float().mean().item() == pytest.approx(0.5, abs=0.1)
+    assert batch.z_single[~own].std(0).tolist() == pytest.approx([1, 1], abs=0.15)
     mean, log_var = (part[:, 0] for part in decoder(torch.cat([batch.z_single, torch.zeros(n, 1)], 1), 1))
     assert torch.allclose(done.c, mean + batch.correction) and torch.equal(done.c, done.c2)
     std = (0.5 * (s3.VARIANCE_SCALE * log_var.exp()).log()).exp().clamp(min=0.05)
