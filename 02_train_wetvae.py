@@ -2,9 +2,9 @@
 
 In: runs/dataset_*.npz of 01. Trains the WET-VAE (Eq. 4) and, to compare, the trajectory VAE (NONE: no labels,
 beta 1, twice the epochs), finds which latent is which factor, and the relation functions. Out, below runs/:
-wetvae_<model>_seed<n>.pt, a figure and results/wetvae.csv. Takes 1.7 minutes on one core, --experiment main
-35 s. Expect (speed, direction, curvature; mean of 10 seeds) purity 0.91, 0.91, 0.92; the axes cover 67, 74,
-54 % of the factors' ranges.
+wetvae_<model>_seed<n>.pt, a figure and results/wetvae.csv. Takes 1.7 to 2.4 minutes on one core, a third of
+that with --experiment main. Expect (speed, direction, curvature; mean of 10 seeds) purity 0.91, 0.91, 0.92;
+the axes cover 67, 74, 54 % of the factors' ranges.
 """
 import itertools
 import math
@@ -283,7 +283,7 @@ def follow_one_skill(encoder, decoder, dataset, hyper):
     example = dataset | dict(trajectories=dataset["example"], factors=dataset["example_factors"])
     x, one_hot, _, ranges = supervision(example, hyper)
     z = encoder(x, one_hot)[0] @ decoder.axes.T  # to the canonical axes: the inverse of Decoder.forward
-    print("one skill, followed: speed 0.6, direction 20 degrees, curvature -10 degrees a transition")
+    print("one skill, followed: the example of 01")
     print("  encoded: z =", ", ".join(f"{name} {value:+.2f}" for name, value in zip(ranges, z[0])))
     for text, rows in (("  its displacements:", x[0]), ("  decoded from z:   ", decoder(z, len(x[0]))[0][0])):
         print(text, *(f"({dx:.2f}, {dy:.2f})" for dx, dy in rows[:10]), " end:", rows.sum(0).numpy().round(2))

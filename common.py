@@ -325,11 +325,11 @@ def convert(value, kind, name):
         return text.lower() in ("true", "1")
     if typing.get_origin(kind) is tuple:
         parts, kinds = text.replace(",", " ").strip("()[] ").split(), typing.get_args(kind)
-        wanted = len(kinds)
+        count = len(kinds)
         if kinds[-1] is Ellipsis:  # one or more
-            kinds, wanted = kinds[:1] * len(parts), max(len(parts), 1)
-        if len(parts) != wanted:
-            stop(f"{name} is {value!r}, but must be {wanted} numbers, as in \"{' '.join('1' * wanted)}\"")
+            kinds, count = kinds[:1] * len(parts), max(len(parts), 1)
+        if len(parts) != count:
+            stop(f"{name} is {value!r}, but must be {count} numbers, as in \"{' '.join('1' * count)}\"")
         return tuple(convert(part, one, name) for part, one in zip(parts, kinds))
     if kind is not bool:
         with contextlib.suppress(decimal.InvalidOperation):  # exact: a float would round a long seed
