@@ -7,7 +7,6 @@ import argparse
 import contextlib
 import csv
 import ctypes.util
-import decimal
 import hashlib
 import io
 import json
@@ -17,8 +16,8 @@ import re
 import signal
 import sys
 import tokenize
-import typing
 from pathlib import Path
+from typing import Annotated, get_args, get_origin
 
 os.environ["MPLBACKEND"] = "Agg"  # a notebook's backend would fail here
 if sys.platform == "linux":  # before mujoco loads: without a screen its default, GLFW, aborts
@@ -32,11 +31,14 @@ from mujoco.batch import Batch
 from torch import nn
 from torch.utils._pytree import tree_leaves
 
-Count = typing.NewType("Count", int)        # a whole number of at least 1 (a plain int: of at least 0)
-Share = typing.NewType("Share", float)      # a number from 0 to 1 (a plain float: of at least 0)
-Positive = typing.NewType("Positive", float)  # a number above 0
-Degrees = typing.NewType("Degrees", float)  # a number from 0 to 180
-Signed = typing.NewType("Signed", float)    # any number
+# Types of constants: least, most, in words. Floats are exact for whole numbers up to 2 ** 53
+Whole = Annotated[int, 0, 2 ** 53, "a whole number of at least 0, at most 2 ** 53"]  # what int means here
+Count = Annotated[int, 1, 2 ** 53, "a whole number of at least 1"]
+Number = Annotated[float, 0, 1e300, "a number of at least 0"]  # what float means here
+Positive = Annotated[float, 1e-300, 1e300, "a number above 0"]
+Signed = Annotated[float, -1e300, 1e300, "a number"]
+Share = Annotated[float, 0, 1, "a number from 0 to 1"]
+Degrees = Annotated[float, 0, 180, "a number from 0 to 180"]
 
 SINGLE = ("speed", "direction")  # factors of z_single, Sec. 4.2.2
 MULTI = dict(curvature="direction", acceleration="speed")  # factors of z_multi, and what they change in time
@@ -308,14 +310,6 @@ def stop(message, code=2):
     raise SystemExit(code)
 
 
-KINDS = {  # declared types: what is allowed, in words, and as (least, most)
-    Count: ("a whole number of at least 1", 1, 2 ** 63 - 1),
-    int: ("a whole number of at least 0, below 2 ** 63", 0, 2 ** 63 - 1),
-    float: ("a number of at least 0", 0, 1e300), Positive: ("a number above 0", 1e-300, 1e300),
-    Share: ("a number from 0 to 1", 0, 1), Degrees: ("a number from 0 to 180", 0, 180),
-    Signed: ("a number", -1e300, 1e300), bool: ("true or false",)}
-
-
 def convert(value, kind, name):
     """A flag's text, or what a file or a row says, as its declared type. Exits with 2 if it does not fit."""
     text = str(value).strip()
@@ -323,21 +317,22 @@ def convert(value, kind, name):
         return text
     if kind is bool and text.lower() in ("true", "false", "1", "0"):
         return text.lower() in ("true", "1")
-    if typing.get_origin(kind) is tuple:
-        parts, kinds = text.replace(",", " ").strip("()[] ").split(), typing.get_args(kind)
+    if get_origin(kind) is tuple:
+        parts, kinds = text.replace(",", " ").strip("()[] ").split(), get_args(kind)
         count = len(kinds)
         if kinds[-1] is Ellipsis:  # one or more
             kinds, count = kinds[:1] * len(parts), max(len(parts), 1)
         if len(parts) != count:
             stop(f"{name} is {value!r}, but must be {count} numbers, as in \"{' '.join('1' * count)}\"")
         return tuple(convert(part, one, name) for part, one in zip(parts, kinds))
+    words = "true or false"
     if kind is not bool:
-        with contextlib.suppress(decimal.InvalidOperation):  # exact: a float would round a long seed
-            number, (_, least, most) = decimal.Decimal(text), KINDS[kind]
-            whole = getattr(kind, "__supertype__", kind) is int
-            if number.is_finite() and least <= number <= most and not (whole and number % 1):
-                return int(number) if whole else float(number)
-    stop(f"{name} is {value!r}, but must be {KINDS[kind][0]}")
+        base, least, most, words = get_args({int: Whole, float: Number}.get(kind, kind))
+        with contextlib.suppress(ValueError):
+            number = float(text)
+            if least <= number <= most and number == base(number):
+                return base(number)
+    stop(f"{name} is {value!r}, but must be {words}")
 
 
 def types_of(module):
