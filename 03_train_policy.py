@@ -37,9 +37,9 @@ UPDATES: Count = 100_000      # updates of the critics (the paper: 1,920,000)
 ROBOTS: Count = 256           # robots that step together
 EPISODE: Count = 200          # steps until a robot starts anew; no terminal state: the value goes on
 SKILL_STEPS: Count = 25       # steps until a robot is given a new skill
-WARM_UP: Count = 10_000       # steps with random actions; their statistics normalise the state
-REPLAY: Count = 1_000_000     # steps in the replay buffer R
-UPDATES_PER_STEP: Count = 8   # updates in each step of all robots
+WARM_UP: Count = 10_000       # steps, of all robots together, with random actions; they normalise the state
+REPLAY: Count = 1_000_000     # steps, of all robots together, in the replay buffer R
+UPDATES_PER_STEP: Count = 8   # updates each time that all robots make a step
 BATCH: Count = 256            # App. A.1.3
 RELABELLED: Share = 0.5       # share of a batch that is relabelled with a fresh skill (the paper: 0)
 CORRECTED: Share = 0.25       # share of skills with a random correction, as in closed loop (the paper: 0)
@@ -47,8 +47,8 @@ CORRECTED: Share = 0.25       # share of skills with a random correction, as in 
 HIDDEN: Count = 256           # width of both hidden layers (the paper: 512; Half-Cheetah 256)
 LEARNING_RATE: Positive = 1e-3  # of Adam (the paper: 0.0003, fixed)
 DECAY_FROM: Share = 0.5       # share of the updates after which it falls linearly to 0 (the paper: 1)
-ACTOR_EVERY: Count = 2        # updates of the critics for each of actor and value network (the paper: 1)
-AVERAGED: Share = 0.002       # rate of the average of the actor's weights that is the policy (the paper: 1)
+ACTOR_EVERY: Count = 2        # updates of the critics for each one of actor, value, target (the paper: 1)
+AVERAGED: Share = 0.002       # rate of the actor's running average, which is the policy (the paper: 1; or 0)
 DISCOUNT: Share = 0.98        # gamma of Eq. 1 (the paper: 0.99): a shorter horizon teaches to follow sooner
 SMOOTHING: Share = 0.01       # of the target value network, App. A.1.3
 REWARD_SCALE: float = 0.1     # of Eq. 6 (the paper: 1)
@@ -94,20 +94,21 @@ MAY_DIFFER = (  # between a policy, or a checkpoint, and the run that uses it
     "FEEDBACK CLASSES").split()
 
 
-# -------- Eq. 6 and Algorithm 1, policy training
+# -------- Eq. 5 in the form of Eq. 6, and Algorithm 1, policy training
 
 def reward(c, log_var, displacement, floor):
-    """REWARD_SCALE * log p_theta(s_t+1 | s_t, z), Eq. 6, (B,), less its normaliser, which no action changes;
-    the entropy of Eq. 6 is in Sac.update. c: command, log_var of the decoder, (B, 2 or 1), trajectory units;
-    displacement (B, 2 or 1), floor: metres. At the end of the Ant's training four fifths of the standard
-    deviations are on the floor, 1 cm: r = -REWARD_SCALE |displacement - STEP_SCALE c|^2 / (2 floor^2)."""
+    """REWARD_SCALE * log p_theta(s_t+1 | s_t, z), Eq. 6, (B,), less its normaliser, which no action changes,
+    and around c, the decoder's mean and a correction; the entropy of Eq. 6 is in Sac.update. c, log_var
+    (B, 2 or 1): trajectory units; displacement (B, 2 or 1), s_t+1 - s_t of Eq. 6, and floor: metres. At the
+    end of the Ant's training four fifths of the standard deviations are on the floor, 1 cm; if both are,
+    r = -REWARD_SCALE |displacement - STEP_SCALE c|^2 / (2 floor^2)."""
     variance = (VARIANCE_SCALE * log_var.exp()).clamp(min=floor ** 2)
     return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * c) ** 2 / variance).sum(1)
 
 
 def random_corrections(n, x_dim):
     """Random corrections of commands, (n, x_dim): 0, but with probability CORRECTED uniform in a disc of
-    radius common.CORRECTION (in one dimension: as long as the points of a disc, with either sign)."""
+    radius common.CORRECTION (in one dimension: the lengths of such points, with either sign)."""
     length = common.CORRECTION * torch.rand(n, 1).sqrt() * (torch.rand(n, 1) < CORRECTED)
     return length * nn.functional.normalize(torch.randn(n, x_dim))
 
@@ -115,14 +116,15 @@ def random_corrections(n, x_dim):
 def train_wedis(decoder, names):
     """Alg. 1, the second loop: a policy that follows single steps of the decoder, which `load` has frozen.
     Returns the policy. Shapes beside the lines: the Ant, n = ROBOTS, B = UPDATES_PER_STEP * BATCH = 2048."""
-    x_dim, m1 = decoder.x_dim, sum(name in SINGLE for name in names)
-    m2 = len(names) - m1
+    x_dim = decoder.x_dim
+    m1 = sum(name in SINGLE for name in names)  # M_1; the axes of z_single come first
+    m2 = len(names) - m1  # M_2
     robots, rng, submit = start_robots()
     s_dim, a_dim = robots.observe().shape[1], robots.ctrl.shape[1]
     sac = Sac(s_dim, x_dim, a_dim)
     replay = Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=x_dim, z_single=m1, correction=x_dim)
-    log = Log(make_policy(sac, decoder, names, STEP_SCALE), robots, rng, replay, sac)
-    skills = replay.latest(ROBOTS)  # zeros, or a checkpoint's
+    log = Log(make_policy(sac, decoder, names, STEP_SCALE), robots, rng, replay, sac)  # it can resume
+    skills = replay.latest(ROBOTS)  # zeros, or what Log has restored
     z_single, correction = skills.z_single, skills.correction
 
     while sac.updates < UPDATES:
@@ -131,15 +133,15 @@ def train_wedis(decoder, names):
         correction = torch.where(over, random_corrections(ROBOTS, x_dim), correction)  # (n, 2)
         z_single = torch.where(over, torch.randn(ROBOTS, m1), z_single)              # (n, 2)
         z = torch.cat([z_single, torch.zeros(ROBOTS, m2)], 1)                        # (n, 3)
-        mean, _ = decoder(z, 1)                                                      # (n, 1, 2)
-        c = mean[:, 0] + correction                                                  # (n, 2), the command
+        mean = decoder(z, 1)[0][:, 0]                                                # (n, 2), world frame
+        c = mean + correction                                                        # (n, 2), the command
 
         # Alg. 1: execute actions a ~ pi(a | s, z_single), here pi(a | s, c); a second core steps the robots
         s = robots.observe()                                                         # (n, 27)
         a = sac.actor.act(s, c)                                                      # (n, 8)
         if replay.added < WARM_UP:
             a = torch.rand(a.shape) * 2 - 1
-        physics = submit(a)
+        physics = submit(a)  # it runs while the networks learn
 
         if replay.added >= WARM_UP:
             if sac.updates == 0:
@@ -151,19 +153,20 @@ def train_wedis(decoder, names):
             batch.z_single = torch.where(fresh, torch.randn(len(fresh), m1), batch.z_single)
             z = torch.cat([batch.z_single, torch.zeros(len(fresh), m2)], 1)          # (B, 3)
 
-            # Alg. 1: compute the reward r = log p_theta(s_t+1 | s_t, z), Eq. 6
+            # Alg. 1: compute the reward r = log p_theta(s_t+1 | s_t, z), Eq. 6; z, mean, c of the batch
             mean, log_var = (out[:, 0] for out in decoder(z, 1))                     # (B, 2) each
             floor = floor_at(sac.updates / UPDATES)
             c = mean + batch.correction                                              # (B, 2)
             r = reward(c, log_var, batch.displacement, floor)                        # (B,)
             on_floor = (VARIANCE_SCALE * log_var.exp() < floor ** 2).float().mean()
 
-            # Alg. 1: optimize psi and the critics with the SAC, BATCH steps at a time. c twice: no skill ends
+            # Alg. 1: optimize psi, psi bar, psi hat with the SAC, BATCH steps at a time. The second c, that
+            # of the next step, is the same: as if no skill ended
             losses = sac.learn(batch, c, c, r)
             log.numbers = losses | dict(reward=r.mean(), on_floor=on_floor)
 
-        # Alg. 1: collect the samples in the replay buffer R (after the updates: both ran side by side)
-        displacement, unstable = physics.result()
+        # Alg. 1: collect the samples in the replay buffer R (after the updates, which ran meanwhile)
+        displacement, unstable = physics.result()                                    # (n, 2) metres, (n,)
         replay.add(unstable, s=s, a=a, s2=robots.observe(), displacement=displacement, z_single=z_single,
                    correction=correction)
         robots.reset(np.flatnonzero((robots.age()[:, 0].numpy() >= EPISODE) | unstable), rng)
@@ -196,7 +199,7 @@ class Sac(nn.Module):
         self.updates, self.losses = 0, {}
 
     def normalise(self, s):
-        """Fix the mean and deviation of the state, once, from random steps s (N, s_dim)."""
+        """Fix the mean and deviation of the state, once, from random steps s (N, s_dim), clamped to +-10."""
         x = self.actor.inputs(s, torch.zeros(len(s), self.actor.arguments[1]))[:, :len(self.actor.s_mean)]
         self.actor.s_mean.copy_(x.mean(0))
         self.actor.s_std.copy_(x.std(0, correction=0).clamp(min=1e-3))
@@ -228,11 +231,11 @@ class Sac(nn.Module):
         if self.updates % ACTOR_EVERY:
             return
         a_new, log_prob = self.actor(x)
-        self.critics.requires_grad_(False)  # or backward computes their gradients too
+        self.critics.requires_grad_(False)  # while q1, q2 are recorded: backward skips their weights
         q1, q2 = (critic(torch.cat([x, a_new], 1)).squeeze(1) for critic in self.critics)
         q_new = torch.minimum(q1, q2)
         self.critics.requires_grad_(True)
-        actor_loss = (TEMPERATURE * log_prob - q_new).mean()
+        actor_loss = (TEMPERATURE * log_prob - q_new).mean()  # -log_prob: the entropy of Eq. 6, by action
         v_loss = 0.5 * ((self.value(x).squeeze(1) - (q_new - TEMPERATURE * log_prob).detach()) ** 2).mean()
         self.actor_adam.zero_grad()
         (actor_loss + v_loss).backward()  # one backward for both: they share no parameter
@@ -255,7 +258,7 @@ def main():
         torch.manual_seed(SEED)
         train = dict(wedis=train_wedis, dads=train_dads, sectar=train_sectar)[METHOD]
         policy = train(source["decoder"], source["names"])
-        policy.relation = source["relation"]
+        policy.relation = source["relation"]  # Alg. 1, "Test: find relation functions", in 02
         common.save(OUT, "policy", EXPERIMENT, SEED, config, **vars(policy))  # before it is measured
     policy = SimpleNamespace(**common.load(OUT, "policy", EXPERIMENT, SEED, **made_with()))
     same_decoder(policy, source["decoder"])

@@ -34,7 +34,7 @@ PORT: int = 8080          # of the page, on this machine alone; 0: the first fre
 METHOD: str = "wedis"     # rows of METHODS below
 MAZES: str = "maze1 maze2"  # rows of MAZE below
 REWARDS: str = "dense sparse"  # Sec. 6.2
-# printed: planned with the decoder's T free steps; executed by sampled actions, no feedback within a skill.
+# printed: planned with one decoder run of T transitions; executed by sampled actions, without feedback.
 # commands: planned with what the robot is commanded. closed: as commands, with feedback and mean actions.
 MODES: str = "printed commands closed"  # one or more of the three
 POLICY: str = "ant_semi"  # experiment of 03
@@ -55,7 +55,7 @@ POOL: Count = 65536       # skills, decoded once, that plans draw from (the pape
 PENALTY: float = 100.0    # w_p, for each transition of a sequence that collides
 REWARD_WEIGHT: float = 5.0  # w_r, sparse reward
 EPSILON: float = 5.0      # epsilon, metres: acceptable error; who ends nearer succeeds
-RADIUS: float = 1.0       # metres by which the planner grows the walls: the Ant's legs (the paper: 0)
+RADIUS: float = 1.0       # metres by which the planner grows the walls, for the Ant's legs (not in the paper)
 GOAL: tuple[Signed, Signed] = (24.0, 12.0)  # metres; the Ant starts at (0, 0)
 
 # Where a value comes from, the later wins: this file, the row of EXPERIMENTS, of MAZE, of METHODS, flags.
@@ -95,71 +95,73 @@ METHODS = {  # Table 2
 }
 
 # -------- Algorithm 2, Sec. 5; its lines are counted from "for i", each "end" is one
-# c: a Configuration (below), the constants of one run in lower case. In common.py c is a command instead.
+# case: a Configuration (below), the constants of one run in lower case.
 
-def plan_and_execute(c, policy, pool):
-    """Algorithm 2 for c.trials robots side by side. Returns their poses (H_E + 1, trials, nq), and for each i
-    the first skills z (trials, M) and the paths (trials, H_P T + 1, 2), metres, of their best plans."""
-    robots = common.Robots(maze_spec(c), c.trials, THREADS)
-    for n in range(c.trials):  # trial n of a policy starts alike for all methods, modes and mazes
-        robots.reset([n], np.random.default_rng((c.seed, c.policy_seed, n)))
-    torch.manual_seed(hash((c.seed, c.policy_seed, 1)))  # plans of its own for each policy
-    closed = c.mode == "closed"
-    skills = c.episode // (c.hold * c.length)
+def plan_and_execute(case, policy, pool):
+    """Algorithm 2 for case.trials robots side by side; pool: of skill_pool. Returns their poses (H_E + 1,
+    trials, nq), and for each i z_1* (trials, M), the first skills of the best plans, and the paths of these
+    plans (trials, H_P T + 1, 2), metres."""
+    robots = common.Robots(maze_spec(case), case.trials, THREADS)
+    for n in range(case.trials):  # trial n of a policy starts alike for all methods, modes and mazes
+        robots.reset([n], np.random.default_rng((case.seed, case.policy_seed, n)))
+    torch.manual_seed(hash((case.seed, case.policy_seed, 1)))  # plans of its own for each policy
+    closed = case.mode == "closed"
+    skills = case.episode // (case.hold * case.length)  # H_E / (H_z T)
     poses, plans = [robots.qpos.copy()[None]], []
-    for i in range(skills):  # line 1; pool: the skills of skill_pool
-        horizon = min(c.planned, skills - i)  # a departure: no plan looks beyond the end of the episode
-        best = [plan(c, policy, pool, horizon, s0) for s0 in robots.place()]  # lines 2 to 11
+    for i in range(skills):  # line 1
+        horizon = min(case.planned, skills - i)  # a departure: no plan looks beyond the end of the episode
+        best = [plan(case, policy, pool, horizon, s0) for s0 in robots.place()]  # lines 2 to 11
         z, paths = map(torch.stack, zip(*best))
-        commands = commands_of(policy, z, c.length)  # in all modes; lines 12, 17 and 18 for all t
-        poses.append(execute(policy, robots, commands, c.hold, closed, deterministic=closed))  # 13 to 16, 19
+        commands = commands_of(policy, z, case.length)  # lines 12, 17 and 18 for all t: (trials, T, 2)
+        # lines 13 to 16, 19; in closed loop with mean actions
+        poses.append(execute(policy, robots, commands, case.hold, closed, deterministic=closed))
         plans.append((z, paths))  # line 20, s_0 of the next round, is where the robots are now
     return np.concatenate(poses), plans
 
 
-def plan(c, policy, pool, horizon, s0):
+def plan(case, policy, pool, horizon, s0):
     """Algorithm 2, lines 2 to 11: the best of N random sequences of `horizon` (H_P) skills from s0 (2,),
-    metres. Returns its first skill z (M,) and its path (H_P T + 1, 2), metres."""
+    metres. Returns its first skill z_1* (M,) and its path (H_P T + 1, 2), metres."""
     z, delta = pool
-    state = s0.expand(c.samples, 1, 2)  # line 2
-    picked = torch.randint(len(z), (c.samples, horizon))  # line 3
+    state = s0.expand(case.samples, 1, 2)  # line 2
+    picked = torch.randint(len(z), (case.samples, horizon))  # line 3; their distribution: skill_pool
     path = [state]
     for j in range(horizon):  # line 4
         delta_j = delta[picked[:, j]]  # lines 5 and 6, decoded once, in skill_pool: (N, T, 2)
         # Trajectory scaling, Fig 3, in metres. The paper prints s_0 where the planned state must stand
-        path.append(state + policy.scale * c.hold * delta_j.cumsum(1))  # line 7
+        path.append(state + policy.scale * case.hold * delta_j.cumsum(1))  # line 7
         state = path[-1][:, -1:]  # line 8
-    path = torch.cat(path, 1)
+    path = torch.cat(path, 1)  # (N, H_P T + 1, 2)
     # Sparse rewards are equal for all sequences that end within epsilon: argmax takes the first of them
-    best = planning_reward(path, c).argmax()  # lines 10 and 11
+    best = planning_reward(path, case).argmax()  # lines 10 and 11
     return z[picked[best, 0]], path[best].clone()  # a copy: a view would keep all N paths in memory
 
 
-def skill_pool(c, policy):
+def skill_pool(case, policy):
     """The skills that plans draw from: z (POOL, M), and the displacements (POOL, T, 2) that the planner
     predicts for them, trajectory units; the decoder's mean, without sampling (App. A.1.4)."""
-    torch.manual_seed(hash((c.seed, c.policy_seed, 0)))
-    high = torch.full((policy.decoder.arguments[0],), c.z_range)
+    torch.manual_seed(hash((case.seed, case.policy_seed, 0)))
+    high = torch.full((policy.decoder.arguments[0],), case.z_range)
     low = -high
     if "speed" in policy.names:  # the paper: U(-1.5, 0), for its axis points the other way
         low[policy.names.index("speed")] = 0
-    z = low + (high - low) * torch.rand(c.pool, len(low))
+    z = low + (high - low) * torch.rand(case.pool, len(low))  # line 3
     delta = []
     for part in z.split(8192):
-        if c.mode == "printed":
-            delta.append(policy.decoder(part, c.length)[0])  # T free steps
+        if case.mode == "printed":
+            delta.append(policy.decoder(part, case.length)[0])  # one run of T transitions with all of z
         else:
-            delta.append(commands_of(policy, part, c.length))  # T first steps, with the relation functions
+            delta.append(commands_of(policy, part, case.length))  # the first step of T runs, one for each f^m
     return z, torch.cat(delta)
 
 
-def planning_reward(path, c):
-    """r_d or r_s, Sec. 6.2, of paths (N, K + 1, 2), metres -> (N,): the task reward of the last state (our
-    choice: the paper does not say which states count) less w_p for each transition that collides."""
-    distance = (path[:, -1] - torch.tensor(c.goal)).norm(dim=1)  # -r(s)
-    penalty = c.penalty * collides(path, c.walls, c.radius).sum(1)
-    if c.reward == "sparse":
-        return c.reward_weight * (distance < c.epsilon) - penalty  # r_s
+def planning_reward(path, case):
+    """r_d or r_s, Sec. 6.2, of paths (N, H_P T + 1, 2), metres -> (N,): the task reward of the last state
+    (our choice: the paper does not say which states count) less w_p for each transition that collides."""
+    distance = (path[:, -1] - torch.tensor(case.goal)).norm(dim=1)  # -r(s)
+    penalty = case.penalty * collides(path, case.walls, case.radius).sum(1)
+    if case.reward == "sparse":
+        return case.reward_weight * (distance < case.epsilon) - penalty  # r_s
     return -distance - penalty  # r_d
 
 
@@ -170,33 +172,35 @@ def main():
     torch.set_num_threads(1)  # tensors are small here; THREADS are for the physics
     if DRIVE:
         from extras.drive import drive  # not in the paper
-        (c, policy, _), pool = runs[0], skill_pool(*runs[0][:2])
-        return drive(c, policy, maze_spec(c), lambda s0: plan(c, policy, pool, c.planned, s0), SECONDS, PORT)
+        (case, policy, _), pool = runs[0], skill_pool(*runs[0][:2])
+        planner = partial(plan, case, policy, pool, case.planned)
+        return drive(case, policy, maze_spec(case), planner, SECONDS, PORT)
     table, start = Path(OUT) / "results" / f"{EXPERIMENT}.csv", time.time()
     done, examples, pools = set(), {}, {}
     if table.exists() and set(DRAW.split()) <= {"fig06", "fig07", "fig14"}:  # others need the paths
         done = {row.get("settings") for row in common.read_csv(table)}
-    for c, policy, settings in runs:
+    for case, policy, settings in runs:
         if settings in done:
-            print(f"{c.title}: in {table} already, with the same settings")
+            print(f"{case.title}: in {table} already, with the same settings")
             continue
-        key = policy.sha256, c.mode == "printed", c.length, c.z_range, c.pool, c.seed, c.policy_seed
+        of_a_pool = case.length, case.z_range, case.pool, case.seed, case.policy_seed
+        key = policy.sha256, case.mode == "printed", *of_a_pool
         if key not in pools:
-            pools[key] = skill_pool(c, policy)
-        poses, plans = plan_and_execute(c, policy, pools[key])
+            pools[key] = skill_pool(case, policy)
+        poses, plans = plan_and_execute(case, policy, pools[key])
         if not examples:
-            follow_one_skill(c, policy, poses, *plans[0])
-        examples.setdefault((c.maze, c.method, c.mode, c.reward),  # trial 0 of the first policy and N
-                            (c, poses[:, 0], [paths[0].numpy() for _, paths in plans]))
-        distances = np.linalg.norm(poses[-1, :, :2] - c.goal, axis=1)
-        seconds = timeit(partial(plan, c, policy, pools[key], c.planned, torch.zeros(2)), number=3) / 3
-        row = dict(maze=c.maze, reward=c.reward, method=c.method, mode=c.mode,
-                   look_ahead=c.planned * c.hold * c.length, samples=c.samples, seed=c.seed,
-                   planning_ms=1e3 * seconds, policy_seed=c.policy_seed,
+            follow_one_skill(case, policy, poses, *plans[0])
+        example = case, poses[:, 0], [paths[0].numpy() for _, paths in plans]  # trial 0
+        examples.setdefault((case.maze, case.method, case.mode, case.reward), example)
+        distances = np.linalg.norm(poses[-1, :, :2] - case.goal, axis=1)
+        seconds = timeit(partial(plan, case, policy, pools[key], case.planned, torch.zeros(2)), number=3) / 3
+        row = dict(maze=case.maze, reward=case.reward, method=case.method, mode=case.mode,
+                   look_ahead=case.planned * case.hold * case.length, samples=case.samples, seed=case.seed,
+                   planning_ms=1e3 * seconds, policy_seed=case.policy_seed,
                    policy=policy.sha256[:8], settings=settings)
-        common.update_csv(table, [row | dict(trial=n, final_distance=d, success=int(d < c.epsilon))
+        common.update_csv(table, [row | dict(trial=n, final_distance=d, success=int(d < case.epsilon))
                                  for n, d in enumerate(distances)], ("settings", "trial"))
-        print(f"{time.time() - start:4.0f} s  {c.title}", flush=True)
+        print(f"{time.time() - start:4.0f} s  {case.title}", flush=True)
     configurations, _, present = zip(*runs)
     rows = [row for row in common.read_csv(table) if row.get("settings") in present]
     print(f"wrote {table}; mean distance to the goal at the end, share of trials nearer than EPSILON:")
@@ -231,8 +235,9 @@ class Configuration:
     goal: tuple
 
     @property
-    def title(c):
-        return f"{c.method} {c.mode}, {c.maze} {c.reward}, N = {c.samples}, {c.policy} seed {c.policy_seed}"
+    def title(self):
+        return (f"{self.method} {self.mode}, {self.maze} {self.reward}, N = {self.samples}, {self.policy} "
+                f"seed {self.policy_seed}")
 
 
 def configurations_of(method, maze, walls, v):
@@ -293,35 +298,36 @@ def check(config, given):
             print(f"{of}: a skill takes {skill_steps} steps, so an episode of {v['EPISODE']} ends at {whole}")
         if "fig07" in DRAW and len(v["LOOK_AHEAD"]) > 1:
             stop("fig07 is for one number of --look_ahead")
-        for c in configurations_of(method, maze, walls, v):
-            key = c.policy, c.policy_seed
+        for case in configurations_of(method, maze, walls, v):
+            key = case.policy, case.policy_seed
             if key not in policies:
                 policies[key] = SimpleNamespace(**common.load(OUT, "policy", *key, **physics))
             policy = policies[key]
             if policy.robot != "ant":
-                stop(f"{c.title}: mazes are for the ant: choose another --policy")
-            if policy.method != "wedis" and c.mode != "printed":
-                stop(f"{c.title}: this mode is for policies of WEDIS: --modes printed")
-            if policy.method == "dads" and c.length > 1:
-                stop(f"{c.title}: DADS predicts one step: --length 1")
-            common.need_memory(40 * c.samples * (c.planned * c.length + 1), "--samples or --look_ahead")
-            common.need_memory(8 * c.pool * (c.length + 100), "--pool")
-            common.need_memory(c.trials * (120 * c.episode + 1e6), "--trials")
-            settings = common.digest(common.made_by(asdict(c)) | dict(sha256=policy.sha256))
-            runs.append((c, policy, settings))
+                stop(f"{case.title}: mazes are for the ant: choose another --policy")
+            if policy.method != "wedis" and case.mode != "printed":
+                stop(f"{case.title}: this mode is for policies of WEDIS: --modes printed")
+            if policy.method == "dads" and case.length > 1:
+                stop(f"{case.title}: DADS predicts one step: --length 1")
+            points = case.samples * (case.planned * case.length + 1)
+            common.need_memory(40 * points, "--samples or --look_ahead")
+            common.need_memory(8 * case.pool * (case.length + 100), "--pool")
+            common.need_memory(case.trials * (120 * case.episode + 1e6), "--trials")
+            settings = common.digest(common.made_by(asdict(case)) | dict(sha256=policy.sha256))
+            runs.append((case, policy, settings))
     if DRIVE and len(runs) > 1:
         stop("drive is for one of each: --mazes, --modes, --policy_seeds, --samples, --look_ahead")
     return runs
 
 
-def maze_spec(c):
+def maze_spec(case):
     """The Ant between real walls 1 m high, and the goal as a red disc."""
     spec = common.robot_spec("ant")
     maze = spec.worldbody.add_body(name="maze")
-    for x0, x1, y0, y1 in c.walls:
+    for x0, x1, y0, y1 in case.walls:
         maze.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=[(x0 + x1) / 2, (y0 + y1) / 2, 0.5], conaffinity=1,
                       size=[(x1 - x0) / 2, (y1 - y0) / 2, 0.5], rgba=[0.45, 0.5, 0.6, 1])
-    spec.worldbody.add_site(pos=[*c.goal, 0.1], type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.8, 0.1, 0],
+    spec.worldbody.add_site(pos=[*case.goal, 0.1], type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.8, 0.1, 0],
                             rgba=[0.85, 0.2, 0.1, 1])
     return spec
 
@@ -348,11 +354,11 @@ def collides(path, walls, radius):
 
 # -------- measuring
 
-def follow_one_skill(c, policy, poses, z, paths):
+def follow_one_skill(case, policy, poses, z, paths):
     """Print the first plan's skill of trial 0, its predicted and its executed end."""
-    predicted, executed = paths[0, c.length].numpy(), poses[c.hold * c.length, 0, :2]
+    predicted, executed = paths[0, case.length].numpy(), poses[case.hold * case.length, 0, :2]
     values = zip(policy.names or map("z{}".format, range(z.shape[1])), z[0])
-    print(f"the first skill of trial 0, {c.title}:")
+    print(f"the first skill of trial 0, {case.title}:")
     print("  z: " + ", ".join(f"{name} {value:.2f}" for name, value in values))
     print("  predicted end ({:.2f}, {:.2f}) m, executed ({:.2f}, {:.2f}) m, ".format(*predicted, *executed)
           + f"{np.linalg.norm(predicted - executed):.2f} m apart")
@@ -389,50 +395,50 @@ def print_table(rows):
 
 # -------- drawing; examples: {(maze, method, mode, reward): (configuration, poses, paths of the plans)}
 
-def draw_maze(ax, c, text, marker):
-    for x0, x1, y0, y1 in c.walls:
+def draw_maze(ax, case, text, marker):
+    for x0, x1, y0, y1 in case.walls:
         ax.add_patch(plt.Rectangle((x0, y0), x1 - x0, y1 - y0, color="#7a869a", lw=0))
     ax.plot(0, 0, "o", ms=5, color="black")
-    ax.plot(*c.goal, marker, ms=9, color=RED)
+    ax.plot(*case.goal, marker, ms=9, color=RED)
     ax.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=text)
 
 
 def draw_fig03(rows, configurations, examples):
     """Fig 3: trajectory scaling, on the first plan: the same shape, H_z times as large, and executed."""
-    c, poses, paths = next(iter(examples.values()))
+    case, poses, paths = next(iter(examples.values()))
     path = paths[0] - paths[0][0]
     figure, axes = plt.subplots(1, 2, figsize=(8, 3.2))
-    for ax, scale, text in zip(axes, (1 / c.hold, 1), ("predicted", f"scaled by $H_z$ = {c.hold}")):
-        for first in range(0, len(path) - 1, c.length):
-            ax.plot(*(path[first:first + c.length + 1] * scale).T, ".-")
-        ax.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"{c.mode}: {text}")
-    axes[1].plot(*(poses[:c.hold * c.length + 1, :2] - poses[0, :2]).T, "k", lw=1, label="executed")
+    for ax, scale, text in zip(axes, (1 / case.hold, 1), ("predicted", f"scaled by $H_z$ = {case.hold}")):
+        for first in range(0, len(path) - 1, case.length):
+            ax.plot(*(path[first:first + case.length + 1] * scale).T, ".-")
+        ax.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"{case.mode}: {text}")
+    axes[1].plot(*(poses[:case.hold * case.length + 1, :2] - poses[0, :2]).T, "k", lw=1, label="executed")
     axes[1].legend()
     common.save_figure(figure, OUT, "fig03_trajectory_scaling")
 
 
 def draw_fig06(rows, configurations, examples):
     """Fig 6: the navigation tasks, goals as red circles."""
-    mazes = {c.maze: c for c in configurations}
+    mazes = {case.maze: case for case in configurations}
     figure, axes = plt.subplots(1, len(mazes), figsize=(4.5 * len(mazes), 3.3), squeeze=False)
-    for ax, (maze, c) in zip(axes[0], mazes.items()):
-        draw_maze(ax, c, maze, "o")
+    for ax, (maze, case) in zip(axes[0], mazes.items()):
+        draw_maze(ax, case, maze, "o")
     common.save_figure(figure, OUT, "fig06_mazes")
 
 
 def draw_fig07(rows, configurations, examples):
     """Fig 7: mean final distance against N, with its 95 % interval over policies and trials; dashed: the
     goal's distance from the origin."""
-    panels = {(c.maze, c.reward): np.hypot(*c.goal) for c in configurations}
+    panels = {(case.maze, case.reward): np.hypot(*case.goal) for case in configurations}
     okabe_ito = cycle([BLUE, RED, "#009E73", "#E69F00", "#CC79A7", "#56B4E9"])
-    colours = dict(zip(dict.fromkeys(c.method for c in configurations), okabe_ito))
+    colours = dict(zip(dict.fromkeys(case.method for case in configurations), okabe_ito))
     marks, rng = dict(printed="o-", commands="s--", closed="^:"), np.random.default_rng(0)
     figure, axes = plt.subplots(1, len(panels), figsize=(3.6 * len(panels), 4), sharey=True, squeeze=False)
     for ax, ((maze, reward), distance) in zip(axes[0], panels.items()):
         ax.axhline(distance, ls="--", color=GREY)
-        for method, mode in dict.fromkeys((c.method, c.mode) for c in configurations):
+        for method, mode in dict.fromkeys((case.method, case.mode) for case in configurations):
             found, where = {}, dict(maze=maze, reward=reward, method=method, mode=mode)
-            for samples in sorted({c.samples for c in configurations}):
+            for samples in sorted({case.samples for case in configurations}):
                 values = values_of(rows, "final_distance", samples=samples, **where)
                 if values.size:
                     interval = np.quantile(resampled_means(values, rng), [0.025, 0.975])
@@ -458,11 +464,11 @@ def draw_examples(name, reward, rows, configurations, examples):
         if (*line, mode) not in shown:
             ax.axis("off")
             continue
-        c, poses, paths = shown[*line, mode]
-        draw_maze(ax, c, f"{c.method} {mode}, {c.maze}", "x")
-        for path, end in zip(paths, poses[c.hold * c.length::c.hold * c.length, :2]):
-            ax.plot(*np.stack([path[c.length], end]).T, "--", color=GREY, lw=1.2)
-            ax.plot(*path[:c.length + 1].T, ".-", color=BLUE, ms=4)
+        case, poses, paths = shown[*line, mode]
+        draw_maze(ax, case, f"{case.method} {mode}, {case.maze}", "x")
+        for path, end in zip(paths, poses[case.hold * case.length::case.hold * case.length, :2]):
+            ax.plot(*np.stack([path[case.length], end]).T, "--", color=GREY, lw=1.2)
+            ax.plot(*path[:case.length + 1].T, ".-", color=BLUE, ms=4)
         ax.plot(*poses[:, :2].T, color=RED, lw=1.2)
     figure.supxlabel("blue: predicted, orange: executed, dashed: error of the end", fontsize=9)
     common.save_figure(figure, OUT, name)

@@ -59,10 +59,11 @@ def weak_labels(factors, names, ranges):
     labels = []
     for name in names:
         if name in MULTI:
-            labels.append(np.sign(factors[name]).astype(int) % 3)  # zero, left, right (A.1.1: right, left)
+            # 0 zero, 1 positive, 2 negative: in A.1.1's example -10 degrees is class three
+            labels.append(np.sign(factors[name]).astype(int) % 3)
         else:
             labels.append(np.digitize(factors[name], np.linspace(*ranges[name], CLASSES[name] + 1)[1:-1]))
-        if name == "direction":  # the paper's first class has the largest angles
+        if name == "direction":  # the first class has the largest angles: in the example 40 degrees is two
             labels[-1] = CLASSES[name] - 1 - labels[-1]
     return np.stack(labels, 1)
 
@@ -100,10 +101,12 @@ class Decoder(nn.Module):
 
 def next_skill(z, names, relation):
     """The relation functions f, Sec. 4.2.2, 6.1.2, A.3.2: z (B, M) of one transition -> of the next. names
-    of the axes; relation {factor of z_multi: weight} (the paper: -0.2, -0.1 by hand, for its axes)."""
+    of the axes; relation {factor of z_multi: weight} (the paper: -0.2, -0.1, by hand; its axes have other
+    signs)."""
     z = z.clone()
     for factor, weight in relation.items():
-        i, change = names.index(MULTI[factor]), weight * z[:, names.index(factor)]
+        i = names.index(MULTI[factor])
+        change = weight * z[:, names.index(factor)]
         if factor == "acceleration" and "direction" not in names:
             change = change * z[:, i].sign()  # f_speed of App. A.3.2: in one dimension a speed has a sign
         z[:, i] += change  # f_dir or f_speed
@@ -112,8 +115,9 @@ def next_skill(z, names, relation):
 
 @torch.no_grad()
 def commands_of(policy, z, steps):
-    """The commands of skills z (B, M): (B, steps, c_dim), trajectory units. WEDIS: the decoder's first step
-    for (z_single, 0), with the relation functions in between. SeCTAR: its decoder's steps. DADS: z itself."""
+    """The commands of skills z (B, M) in `steps` transitions: (B, steps, c_dim), trajectory units. WEDIS: the
+    decoder's first displacement for (z_single, 0), then f^m, and so on. SeCTAR: its decoder's displacements.
+    DADS: z itself."""
     if policy.method == "dads":
         return z[:, None].expand(-1, steps, -1)
     if policy.method == "sectar":
@@ -121,9 +125,9 @@ def commands_of(policy, z, steps):
     is_single = torch.tensor([float(name in SINGLE) for name in policy.names])
     singles = []
     for _ in range(steps):
-        singles.append(z * is_single)  # (z_single, 0)
+        singles.append(z * is_single)  # (z_single, 0); at first Alg. 2, line 12
         z = next_skill(z, policy.names, policy.relation)  # Alg. 2, lines 17 and 18
-    mean, _ = policy.decoder(torch.cat(singles), 1)
+    mean, _ = policy.decoder(torch.cat(singles), 1)  # (steps * B, 1, c_dim)
     return mean.view(steps, len(z), -1).transpose(0, 1)
 
 
@@ -158,7 +162,8 @@ class Robots:
         return torch.from_numpy(self.qpos[:, :self.places]).float()
 
     def observe(self):
-        """The policy's state, App. A.1.3: qpos without the place, qvel. (n, 27), Half-Cheetah (n, 17)."""
+        """The policy's state, App. A.1.3: qpos without the place, then qvel. Ant (n, 27): height, quaternion
+        (4), joints (8), velocity (3), turning rates (3), joint speeds (8). Half-Cheetah (n, 17)."""
         return torch.from_numpy(np.concatenate([self.qpos[:, self.places:], self.qvel], 1)).float()
 
     def age(self):
@@ -188,9 +193,10 @@ def to_base_frame(s, c):
     The dynamics do not depend on the heading: what is learnt for one holds for all."""
     half = torch.atan2(s[:, 4], s[:, 1])  # half the heading, from w and z of the quaternion s[:, 1:5]
     upright = torch.hypot(s[:, 1], s[:, 4])[:, None]
-    tilt, velocity = rotate(s[:, 2:4], -half), rotate(s[:, 13:15], -2 * half)
-    body = s[:, 5:13], velocity, s[:, 15:]  # joints; velocity; the rest, which no heading changes
-    return torch.cat([s[:, :1], upright, tilt, *body], 1), rotate(c, -2 * half)
+    tilt = rotate(s[:, 2:4], -half)  # a quaternion is heading times tilt: its x and y turn by half
+    velocity = rotate(s[:, 13:15], -2 * half)
+    rest = s[:, 15:]  # vertical velocity, and speeds that MuJoCo gives in the torso's or the joints' frames
+    return torch.cat([s[:, :1], upright, tilt, s[:, 5:13], velocity, rest], 1), rotate(c, -2 * half)
 
 
 def layers(n_in, hidden, n_out):
@@ -235,7 +241,7 @@ class Actor(nn.Module):
         return self(self.inputs(s, c), deterministic)[0]
 
 
-# -------- execution of skills, Alg. 2, lines 13 to 19
+# -------- execution of skills, Alg. 2, lines 13 to 16 and 19
 
 def closed_loop(c, reference, robots, scale):
     """Commands (n, 2 or 1), trajectory units: c plus a share of reference - place (both in metres), up to
@@ -247,13 +253,15 @@ def closed_loop(c, reference, robots, scale):
 
 
 def execute(policy, robots, commands, hold, closed, deterministic):
-    """Alg. 2, lines 13 to 16: hold each command (n, T, c_dim) for `hold` (H_z) steps; commands_of has 17, 18.
-    closed: a reference advances by the command. Returns the poses after each step, (T * hold, n, nq)."""
+    """Alg. 2, lines 13 to 16: hold each command (n, T, c_dim) for `hold` (H_z) steps. closed: with feedback to
+    a reference, which moves by each command. deterministic: mean actions. Returns the poses after each step,
+    (T * hold, n, nq)."""
     reference, poses, ever_unstable = robots.place(), [], False
-    for c in commands.unbind(1):
-        for _ in range(hold):
-            command = closed_loop(c, reference, robots, policy.scale) if closed else c
-            _, unstable = robots.step(policy.actor.act(robots.observe(), command, deterministic).numpy())
+    for c in commands.unbind(1):  # line 13
+        for _ in range(hold):  # line 14
+            asked = closed_loop(c, reference, robots, policy.scale) if closed else c
+            a = policy.actor.act(robots.observe(), asked, deterministic)  # line 15
+            _, unstable = robots.step(a.numpy())
             reference = reference + policy.scale * c if closed else reference
             poses.append(robots.qpos.copy())
             ever_unstable |= unstable
