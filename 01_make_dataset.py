@@ -15,7 +15,7 @@ from common import Count, Degrees, Positive, Share, Signed, plt, stop, weak_labe
 EXPERIMENT: str = "main"      # row of EXPERIMENTS below
 SEED: int = 0                 # random seed of the whole chain: data, decoder, policy
 OUT: str = "runs"             # folder of all that is written
-FIGURE: str = ""              # name of the figure, if factors have one ("": dataset_<experiment>)
+FIGURE: str = ""              # name of Fig 9, drawn for these FACTORS alone ("": dataset_<experiment>)
 
 TRAJECTORIES: Count = 100_000  # N, App. A.1.1
 LENGTH: Count = 5             # T, transitions per trajectory
@@ -24,8 +24,8 @@ SPEED_LOW: Signed = 0.0       # speed ~ U(SPEED_LOW, SPEED_HIGH), Table 1, traje
 SPEED_HIGH: Positive = 1.0    # in one dimension a speed has a sign
 DIRECTION: Degrees = 90.0     # direction ~ U(-DIRECTION, DIRECTION), degrees: the right-sided semicircle
 CURVATURE: Degrees = 30.0     # curvature ~ U(-CURVATURE, CURVATURE), degrees per transition; + turns left
-ACCELERATION: float = 0.2     # acceleration ~ U(-ACCELERATION, ACCELERATION) times the speed per transition
-STRAIGHT: Share = 0.2         # probability that the curvature is exactly 0; ours: of the acceleration too
+ACCELERATION: float = 0.2     # growth per transition, a share of the speed, ~ U(-ACCELERATION, ACCELERATION)
+STRAIGHT: Share = 0.2         # probability that the curvature (ours: the acceleration too) is exactly 0
 
 EXPERIMENTS = {  # a row names the constants in which an experiment differs
     "main": dict(FIGURE="fig09_dataset"),
@@ -34,7 +34,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs
     "speed_acc": dict(FACTORS="speed acceleration", SPEED_LOW=-1.0),      # Fig 12 and 16, in one dimension
     "four_factors": dict(FACTORS="speed direction curvature acceleration", DIRECTION=180.0),  # Fig 13
 }
-# The example that all four scripts follow
+# The example that 01, 02 and 03 follow
 EXAMPLE = dict(speed=np.array([0.6]), direction=np.radians([20.0]), curvature=np.radians([-10.0]))
 
 

@@ -4,7 +4,7 @@ In: runs/dataset_*.npz of 01. Trains the WET-VAE (Eq. 4) and, to compare, the tr
 beta 1, twice the epochs), finds which latent is which factor, and the relation functions. Out, below runs/:
 wetvae_<model>_seed<n>.pt, a figure and results/wetvae.csv. Takes 1.7 to 2.4 minutes on one core, a third of
 that with --experiment main. Expect (speed, direction, curvature; mean of 10 seeds) purity 0.91, 0.91, 0.92;
-the axes cover 67, 74, 54 % of the factors' ranges.
+the axes cover 67, 74, 55 % of the factors' ranges; relation weight 0.21 (the paper: -0.2; signs differ).
 """
 import itertools
 import math
@@ -50,7 +50,7 @@ MODELS = {  # a row names the constants, from DATA to Z_RANGE, in which a model 
     "main": {}, "main_none": NONE, "full": dict(DATA="full"), "four_factors": FOUR,
     "polar": POLAR, "polar_cartesian": POLAR | dict(LABELS="x y"),
     "polar_none": POLAR | NONE | dict(LABELS="x y"), "speed_acc": LINE, "speed_acc_none": LINE | NONE,
-    # To be run with ten seeds: own axes and beta's warm-up, one of the two, neither, no labels.
+    # To be run with ten seeds: own axes and beta's warm-up, one of the two, neither (24 epochs), no labels.
     "seeds": {}, "seeds_own_axis": dict(BETA_WARM_UP=0), "seeds_warm_up": dict(OWN_AXIS=False),
     "seeds_plain": PRINTED | dict(EPOCHS=24), "seeds_none": NONE, "beta_gamma": PRINTED,
 } | {f"beta_gamma_b{beta}_g{gamma}": PRINTED | dict(BETA=beta, GAMMA=gamma) for beta, gamma in WEIGHTS}
@@ -73,11 +73,11 @@ class Encoder(nn.Module):
         self.cell = nn.LSTMCell(x_dim + y_dim, hidden)  # in short loops faster than nn.LSTM
         self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2 * z_dim))
 
-    def forward(self, x, y):
-        """x (B, T, x_dim), y (B, y_dim) one-hot labels side by side -> mean, log-variance (B, z_dim) each."""
+    def forward(self, x, one_hot):
+        """x (B, T, x_dim), labels one_hot (B, y_dim), side by side -> mean, log-variance (B, z_dim) each."""
         state = None
         for displacement in x.unbind(1):
-            state = self.cell(torch.cat([displacement, y], 1), state)  # labels at each step, App. A.1.2
+            state = self.cell(torch.cat([displacement, one_hot], 1), state)  # labels at each step, App. A.1.2
         return self.head(state[0]).chunk(2, 1)
 
 
@@ -115,7 +115,7 @@ def objective(encoder, decoder, label_decoders, x, one_hot, y):
     """The three terms of Eq. 3 and 4: sums over time, dimensions and labels, means over the batch.
     x (B, T, x_dim) displacements; the labels as one_hot (B, y_dim), side by side, and as classes y (B, M)."""
     mean, log_var = encoder(x, one_hot)
-    z = mean + torch.randn_like(mean) * (0.5 * log_var).exp()  # z ~ q(z | tau, y): "latents" of Decoder
+    z = mean + torch.randn_like(mean) * (0.5 * log_var).exp()  # z ~ q(z | tau, y): latents, not yet axes
     # sum_t log p(s_t | s_1:t-1, z); in place of s_1:t-1 the decoder reads its own means
     log_p_tau = log_normal(x, *decoder.decode_latents(z, x.shape[1])).sum((1, 2)).mean()
     logits = label_decoders(z)
@@ -180,7 +180,7 @@ def check_factors(decoder, names, steps):
     with np.errstate(invalid="ignore", divide="ignore"):  # a factor that never changes has no correlation
         corr = np.nan_to_num(np.corrcoef(latents.double().numpy().T, found)[:n, n:])  # latents x factors
     best = list(max(itertools.permutations(range(n)), key=lambda order: abs(corr[order, range(n)]).sum()))
-    decoder.axes.zero_()
+    decoder.axes.zero_()  # best[m]: the latent of factor m
     decoder.axes[range(n), best] = torch.from_numpy(np.where(corr[best, range(n)] < 0, -1, 1)).float()
     return abs(corr[best, range(n)])
 
@@ -220,7 +220,8 @@ def main():
         constants = {field.upper(): value for field, value in vars(hyper).items()}
         if TRAIN:
             print(f"\n{name}, seed {SEED}, beta {hyper.beta:g}, gamma {hyper.gamma:g}")
-            clock, (x, one_hot, y, ranges) = time.time(), supervision(datasets[hyper.data], hyper)
+            clock = time.time()
+            x, one_hot, y, ranges = supervision(datasets[hyper.data], hyper)
             names, steps = list(ranges), x.shape[1]
             torch.manual_seed(SEED)
             encoder, decoder = train(x, one_hot, y, names, hyper)
@@ -250,8 +251,7 @@ def hyperparameters(name, config, given):
 
 
 def check(columns, models, datasets):
-    """End with one line, before training, if a row names what is not there or a model does not fit its data.
-    """
+    """End with one line, before training, if a row names what is not there or a model misfits its data."""
     if EXPERIMENT not in (*FIGURES, *MODELS):
         stop(f"unknown experiment {EXPERIMENT!r}; allowed: {' '.join([*FIGURES, *MODELS])}")
     for column in columns:
@@ -279,7 +279,7 @@ def check(columns, models, datasets):
 
 @torch.no_grad()
 def follow_one_skill(encoder, decoder, dataset, hyper):
-    """Print what the model makes of the example that all four scripts follow. Returns its z."""
+    """Print what the model makes of the example that 01, 02 and 03 follow. Returns its z."""
     example = dataset | dict(trajectories=dataset["example"], factors=dataset["example_factors"])
     x, one_hot, _, ranges = supervision(example, hyper)
     z = encoder(x, one_hot)[0] @ decoder.axes.T  # to the canonical axes: the inverse of Decoder.forward

@@ -651,7 +651,7 @@ def measure(policy, ranges):
 
 
 def follow_one_skill(policy, source):
-    """The example that all four scripts follow: its command, and a step of the robot after 40 steps of it."""
+    """The example that 01, 02 and 03 follow: its command, and a step of the robot after 40 steps of it."""
     if METHOD != "wedis" or not source.get("example"):
         return
     z = torch.tensor([source["example"]]) * torch.tensor([float(name in SINGLE) for name in policy.names])

@@ -253,7 +253,7 @@ def closed_loop(c, reference, robots, scale):
 
 
 def execute(policy, robots, commands, hold, closed, deterministic):
-    """Alg. 2, lines 13 to 16: hold each command (n, T, c_dim) for `hold` (H_z) steps. closed: with feedback to
+    """Alg. 2, lines 13 to 16: hold each command (n, T, c_dim) for `hold` (H_z) steps. closed: feedback to
     a reference, which moves by each command. deterministic: mean actions. Returns the poses after each step,
     (T * hold, n, nq)."""
     reference, poses, ever_unstable = robots.place(), [], False

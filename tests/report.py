@@ -35,7 +35,7 @@ KEYS = {  # of each shipped file: the columns that name a row, or a group of row
 DECODERS = ("main", "main_none", "full", "speed_acc")  # that policies and Fig 4 need, of all seeds
 CORES = {"1": "one core, another training beside it", "2": "two cores"}
 LARGEST = 2_000_000  # bytes of a shipped file
-SHORTEST_PATH = 36   # metres, in Maze 1 and 2; tests/test_maze.py computes it
+SHORTEST_PATH = 36.4  # metres, in Maze 1 and 2; tests/test_maze.py computes it
 NOT_YET = "not measured yet"
 PANELS = [(maze, kind) for maze in ("maze1", "maze2") for kind in ("dense", "sparse")]
 MODES = ("printed", "commands", "closed")
@@ -188,16 +188,19 @@ def scripts():
     purity = " / ".join(number(row["purity"]) for row in vae if row["labels"] == "main")
     error, closed, minutes = (number(policy.get(key), form) for key, form in (
         ("tracking_error", ".2f"), ("tracking_error_closed", ".2f"), ("train_minutes", ".0f")))
-    # The default run's minutes are in the docstring of 04, by hand
+    # The minutes of default runs on two cores are in the docstrings, by hand
     text = re.search(r"python 04_mpc_maze\.py .*?([\d.]+) (s|minutes?) on two cores", (ROOT / "04_mpc_maze.py").read_text(encoding="utf-8"))
+    train = re.search(r"Takes (\d+ to \d+) minutes on two cores", (ROOT / "03_train_policy.py").read_text(encoding="utf-8"))
+    ends = [by_policy(rows, "final_distance").mean() for maze in ("maze1", "maze2") if (rows := select(
+        results("mazes"), maze=maze, method="wedis", mode="closed", reward="dense", policy_seed=0))]
     return markdown(["command", "minutes", "makes", "expect (seed 0)"], [
         ["`python 01_make_dataset.py`", "0.1", "100,000 trajectories, Table 1, Fig 9", "20 % of them straight, mean speed 0.50"],
         ["`python 02_train_wetvae.py`", f"{seconds / 60:.1f} (one core)" if vae else "-", "WET-VAE and trajectory VAE, Fig 4",
          f"purity {purity}" if vae else NOT_YET],
-        ["`python 03_train_policy.py`", f"{minutes} ({CORES[policy['threads']]})" if policy else NOT_YET, "skill policy of the Ant, Fig 5",
+        ["`python 03_train_policy.py`", f"{train[1]}; the shipped one {minutes} ({CORES[policy['threads']]})" if policy and train else NOT_YET, "skill policy of the Ant, Fig 5",
          f"tracking error {error} open loop, {closed} closed loop" if policy else NOT_YET],
         ["`python 04_mpc_maze.py`", f"{float(text[1]) / (60 if text[2] == 's' else 1):.1f}" if text else NOT_YET,
-         "mazes, Fig 3, 6, 8, 14, 17, GIFs", "its first policy's share of the table above"]])
+         "mazes, Fig 3, 6, 8, 14, 17, GIFs", "dense, closed loop: {:.1f} and {:.1f} m from the goal".format(*ends) if len(ends) == 2 else NOT_YET]])
 
 
 CLEAR = 0.8  # purity from which an axis counts as its factor
@@ -217,11 +220,11 @@ def purities(experiment, labels):
 def fig4():
     """The models of three factors: purity (coverage), mean of the seeds."""
     rows = []
-    for experiment, labels, name in (("main", "main", "WET-VAE, seed 0"), ("seeds", "seeds", "WET-VAE"),
+    for experiment, labels, name in (("main", "main", "WET-VAE, the shipped ones"), ("seeds", "seeds", "WET-VAE"),
                                      ("seeds", "own_axis", "... without beta's warm-up"),
                                      ("seeds", "warm_up", "... labels read from all of z"),
-                                     ("seeds", "plain", "... with neither: Eq. 4 as printed"),
-                                     ("main", "none", "trajectory VAE, seed 0"), ("seeds", "none", "trajectory VAE")):
+                                     ("seeds", "plain", "... with neither own axes nor warm-up: Eq. 4 as printed (24 epochs)"),
+                                     ("main", "none", "trajectory VAE, the shipped one"), ("seeds", "none", "trajectory VAE")):
         pure, cover, factors = purities(experiment, labels)
         if len(pure):
             rows.append([name, str(len(pure))] + [f"{p:.2f} ({100 * c:.0f} %)" if p else "-" for p, c in zip(pure.mean(0), cover.mean(0))]
@@ -324,11 +327,11 @@ def not_counted():
     return ["", f"*Not counted: {'; '.join(reasons)}.*"] if reasons else []
 
 
-def over_seeds(flags, least=1):
+def over_seeds(flags, least=1, what="seeds"):
     """A verdict on a claim that is tried with several seeds: it holds with all, or does not with at least half of them."""
     n, k = len(flags), sum(map(bool, flags))
     word = "holds" if k == n else "does not hold" if 2 * k <= n else "undecided"
-    return f"{word if n >= least else 'undecided'} ({k} of {n} seeds)" if n else NOT_YET
+    return f"{word if n >= least else 'undecided'} ({k} of {n} {what})" if n else NOT_YET
 
 
 def axes_text(pure):
@@ -368,8 +371,8 @@ def skill_claims():
         ["speed and acceleration in 1D (Fig 12)", over_seeds(clear(line)), axes_text(line)],
         ["... nothing meaningful without labels", over_seeds([seed.max() < CLEAR for seed in line_none]), axes_text(line_none)],
         ["four factors in one model (Fig 13)", over_seeds(clear(four)), axes_text(four)],
-        ["empty angles on the full circle (A.3.1)", over_seeds([gap > 5 for gap in gaps[0]]),
-         "largest one, degrees: {} (two factors: {}, four: {})".format(*gap_text)],
+        ["empty angles on the full circle (A.3.1)", over_seeds([gap > 5 for found in gaps for gap in found], what="models"),
+         "largest one, degrees: three factors {}; two (Fig 11) {}; four (Fig 13) {}".format(*gap_text)],
         ["executed skills are similar to predicted ones (Fig 5)", "no threshold",
          f"open loop: tracking error {errors[0]}; executed speed purity {errors[1]}"]]
 

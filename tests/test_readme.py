@@ -250,7 +250,7 @@ def test_tables_with_some_of_the_rows(repo):
     assert cells[0][2].endswith(" m, 0 %") and cells[0][3] == "-" and cells[0][4].endswith(" m, 100 %")
     assert [row[2] for row in cells[1:]] == ["-"] * 3
     assert "N = 10,000" in lines[-1] and "3 policies x 4 trials" in lines[-1]
-    assert "26.8 m from the goal" in lines[-1] and "36 m long" in lines[-1]
+    assert "26.8 m from the goal" in lines[-1] and "36.4 m long" in lines[-1]
     repo.write("figure7", panels(9) + panels(4, mode="commands") + planning_rows(20, method="dads", look_ahead=240))
     lines = report.fig7()
     assert [line.split(",")[0] for line in lines[2:5]] == ["| WEDIS", "| WEDIS", "| DADS"]
@@ -311,9 +311,9 @@ def test_a_claim_about_the_model_is_judged_over_its_seeds(repo):
 
 
 @pytest.mark.parametrize("found, verdict, text", [
-    ((28.4, 30.5), "holds (2 of 2 seeds)", "28.4, 30.5 (two factors: 13.5, four: 0.3)"),
-    ((28.4, 4.9, 6), "undecided (2 of 3 seeds)", "28.4, 4.9, 6.0 (two factors: 13.5, four: 0.3)")])
-def test_empty_angles_are_those_of_full_beside_two_and_four_factors(repo, found, verdict, text):
+    ((28.4, 30.5), "undecided (3 of 4 models)", "three factors 28.4, 30.5; two (Fig 11) 13.5; four (Fig 13) 0.3"),
+    ((0.2, 4.9, 6), "does not hold (2 of 5 models)", "three factors 0.2, 4.9, 6.0; two (Fig 11) 13.5; four (Fig 13) 0.3")])
+def test_empty_angles_are_those_of_all_models_on_the_full_circle(repo, found, verdict, text):
     same = dict(factor="direction", purity=0.9, crosstalk="direction 0.7", settings="s")
     repo.write("wetvae", [dict(experiment=name, labels=labels, seed=seed, largest_gap_deg=gap) | same for name, labels, gaps in (
         ("polar", "polar", [13.5]), ("polar", "none", [99]), ("full", "full", found), ("four_factors", "four_factors", [0.3]))
