@@ -81,8 +81,7 @@ MAZE = {  # walls, and the constants in which a maze differs; plan a row of your
     "open": dict(WALLS=[]),
 }
 # App. A.1.4 gives DADS U(-1, 1), as it is trained, and SeCTAR U(-1.5, 1.5); Table 2 swaps the two.
-DADS = dict(MODES="printed", POLICY="ant_dads", POLICY_SEEDS=(0,), EPISODE=300, HOLD=20, LENGTH=1, PLANNED=4,
-            Z_RANGE=1)
+DADS = dict(MODES="printed", POLICY="ant_dads", EPISODE=300, HOLD=20, LENGTH=1, PLANNED=4, Z_RANGE=1)
 METHODS = {  # Table 2
     "wedis": {},
     "wedis_s": dict(MODES="printed commands", LENGTH=1, PLANNED=4),  # single steps

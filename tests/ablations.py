@@ -3,6 +3,8 @@
 FOLDER/<name>_s<seed>/policy_ant_semi_seed<seed>.pt: policies of 03 that were trained with one thing set back to the paper's
 value (name `shipped`: nothing). Each is measured as 03 does, and plans in Maze 1 as 04 does; about a minute each. Rows made
 with the same policy and constants are kept. tests/report.py makes of them a table, and the effects in README.md.
+python tests/ablations.py closed   what the parts of the closed loop do to the shipped ant_semi policies, without training:
+results/closed_loop.csv, 7 minutes.
 """
 import importlib
 import re
@@ -28,6 +30,7 @@ MEASURES = {  # column -> in words, format, factor
     "updates_per_second": ("updates a second", ".0f", 1), "maze1_distance_m": ("Maze 1, distance to the goal, m", ".1f", 1),
     "maze1_success": ("Maze 1, success, %", ".0f", 100),
 }
+IN_EACH_CELL = ("tracking_error", "tracking_error_closed", "fall_rate")
 LABEL_MODELS = dict(own_axis="warm_up", beta_warm_up="own_axis", own_axis_and_warm_up="plain")  # rows `seeds` of 02
 
 
@@ -73,18 +76,69 @@ def main(folder):
         print(*(f"{key} {value:.3g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()), sep="  ")
 
 
+# ---------------------------------------------------------------- parts of the closed loop, without training
+
+def same_share(c, reference, robots, scale):
+    """closed_loop as it would be if it corrected slow commands no more than fast ones."""
+    correction = common.FEEDBACK * (reference - robots.place()) / scale
+    size = correction.norm(dim=1, keepdim=True)
+    return c + correction * (common.CORRECTION / size.clamp(min=common.CORRECTION))
+
+
+LOOPS = {  # what differs in common.py
+    "as shipped": {}, "slow commands corrected no more": dict(closed_loop=same_share), "no limit": dict(CORRECTION=1e6),
+    "half the limit": dict(CORRECTION=0.1), "no feedback": dict(FEEDBACK=0.0)}
+
+
+def closed_loops(stage3, folder, seeds):
+    """A row for each policy ant_semi in the folder and each law."""
+    rows = []
+    for seed in seeds:
+        common.parse_flags(vars(stage3), ["--out", str(folder), "--seed", str(seed), "--threads", "1"])
+        policy = SimpleNamespace(**common.load(stage3.OUT, "policy", "ant_semi", seed))
+        ranges = common.load(stage3.OUT, "wetvae", "main", seed)["ranges"]
+        for name, changes in LOOPS.items():
+            before = {key: getattr(common, key) for key in changes}
+            vars(common).update(changes)
+            try:
+                row = dict(loop=name, seed=seed, tracking_error_closed=stage3.tracking(policy, True)) | stage3.following(policy, True)
+                row["purity_speed"] = stage3.executed_cross_talk(policy, ranges, True)[1][0]
+            finally:
+                vars(common).update(before)
+            rows.append(row)
+            print(*(f"{key} {value:.3g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()),
+                  sep="  ", flush=True)
+    common.update_csv(ROOT / "results" / "closed_loop.csv", rows, ("loop", "seed"))
+
+
+def closed_table(rows):
+    """Lines of markdown: a row for each law, a cell for each seed."""
+    head, seeds = ["closed loop"], list(dict.fromkeys(row["seed"] for row in rows))
+    shown = {"tracking_error_closed": (".2f", 1), "follow_median_m": (".2f", 1), "follow_p90_m": (".2f", 1), "fall_rate": (".1f", 100),
+             "purity_speed": (".2f", 1)}
+    lines = []
+    for name in dict.fromkeys(row["loop"] for row in rows):
+        cells = [" / ".join(f"{factor * float(row[column]):{form}}" for row in rows if row["loop"] == name)
+                 for column, (form, factor) in shown.items()]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    head += ["tracking error", "following error, median m", "90 %, m", "falls, %", "purity, speed"]
+    head[0] += f" (seeds {', '.join(seeds)})"
+    return ["| " + " | ".join(head) + " |", "|---" * len(head) + "|", *lines] if rows else []
+
+
 # ---------------------------------------------------------------- numbers for both READMEs
 
 def means(rows, name):
-    """The values of an ablation and of `shipped`, and what two seeds of `shipped` differ by (nan: there is one), by measure:
-    means of the seeds that both have. None if there are none."""
-    seeds = {who: {row["seed"]: row for row in rows if row["without"] == who} for who in (name, "shipped")}
-    both, found = sorted(set(seeds[name]) & set(seeds["shipped"])), {}
+    """Means over the seeds of an ablation and of `shipped`, and what seeds of `shipped` differ by (nan: there is one), by
+    measure. None if there are none."""
+    own_rows, shipped_rows = ([row for row in rows if row["without"] == who] for who in (name, "shipped"))
+    if not (own_rows and shipped_rows):
+        return None
+    found = {}
     for column, (_, _, factor) in MEASURES.items():
-        own, shipped = ([factor * float(seeds[who][seed].get(column) or "nan") for seed in both] for who in (name, "shipped"))
-        every = [factor * float(row.get(column) or "nan") for row in seeds["shipped"].values()]
-        found[column] = np.mean(own or [np.nan]), np.mean(shipped or [np.nan]), np.ptp(every) if len(every) > 1 else np.nan
-    return SimpleNamespace(seeds=len(both), **found) if both else None
+        own, shipped = ([factor * float(row.get(column) or "nan") for row in some] for some in (own_rows, shipped_rows))
+        found[column] = np.mean(own), np.mean(shipped), np.ptp(shipped) if len(shipped) > 1 else np.nan
+    return SimpleNamespace(seeds=len(own_rows), **found)
 
 
 def table(rows):
@@ -92,7 +146,7 @@ def table(rows):
     lines = []
     for name in dict.fromkeys(row["without"] for row in sorted(rows, key=lambda row: row["without"] != "shipped")):
         found = means(rows, name)
-        cells = [f"`{name}`", str(found.seeds) if found else "no seed in common with `shipped`"]
+        cells = [f"`{name}`", str(found.seeds) if found else "`shipped` is missing"]
         for column, (_, form, _) in MEASURES.items() if found else ():
             own, shipped, two_seeds = getattr(found, column)
             units = f" ({(own - shipped) / two_seeds:+.1f})" if name != "shipped" and two_seeds > 0 else ""
@@ -103,20 +157,21 @@ def table(rows):
 
 
 def effect(name, results):
-    """What a departure does, in plain words: of all measures the one that moves most without it, as a share of what two
-    seeds differ by, or of a fifth of its value if that is more (or of 2, if it is in per cent). results: reads a file of
-    results/ by its name."""
+    """What a departure does, in plain words: tracking error in open and closed loop and falls without it; and of all other
+    measures of the policy the one that moves most, as a share of what two seeds differ by, or of a fifth of its value if that
+    is more (or of 2, if it is in per cent). results: reads a file of results/ by its name."""
     if name in LABEL_MODELS:
         return label_effect(LABEL_MODELS[name], results("wetvae"))
-    found, best, moved = means(results("ablations"), name), NOT_YET, 1.0
-    if not found or name == "shipped":
-        return best
+    found, moved, text = means(results("ablations"), name), 1.0, ""
+    if not found:
+        return NOT_YET
+    (error, _, _), (closed, _, _), (falls, _, _) = (getattr(found, column) for column in IN_EACH_CELL)
     for column, (words, form, factor) in MEASURES.items():
         own, shipped, two_seeds = getattr(found, column)
         change = abs(own - shipped) / max(np.nan_to_num(two_seeds), abs(shipped) / 5, 2.0 if factor == 100 else 1e-9)
-        if change > moved:
-            best, moved = f"{words}: {own:{form}} instead of {shipped:{form}}", change
-    return best if moved > 1 else "no measure moves by more than a fifth, or than two seeds differ"
+        if change > moved and column not in (*IN_EACH_CELL, "updates_per_second"):
+            text, moved = f"; {words}: {own:{form}} instead of {shipped:{form}}", change
+    return f"{error:.2f} / {closed:.2f}, {falls:.0f} %{text}"
 
 
 def label_effect(labels, rows):
@@ -133,6 +188,9 @@ def label_effect(labels, rows):
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2 or not Path(sys.argv[1]).is_dir():
-        common.stop("usage: python tests/ablations.py FOLDER")
-    main(Path(sys.argv[1]))
+    if sys.argv[1:] == ["closed"]:
+        closed_loops(importlib.import_module("03_train_policy"), ROOT / "pretrained", (0, 1, 2))
+    elif len(sys.argv) == 2 and Path(sys.argv[1]).is_dir():
+        main(Path(sys.argv[1]))
+    else:
+        common.stop("usage: python tests/ablations.py FOLDER, or: closed")

@@ -197,7 +197,8 @@ def scripts():
         ["`python 01_make_dataset.py`", "0.1", "100,000 trajectories, Table 1, Fig 9", "20 % of them straight, mean speed 0.50"],
         ["`python 02_train_wetvae.py`", f"{seconds / 60:.1f} (one core)" if vae else "-", "WET-VAE and trajectory VAE, Fig 4",
          f"purity {purity}" if vae else NOT_YET],
-        ["`python 03_train_policy.py`", f"{train[1]}; the shipped one {minutes} ({CORES[policy['threads']]})" if policy and train else NOT_YET, "skill policy of the Ant, Fig 5",
+        ["`python 03_train_policy.py`", f"{train[1]}; the shipped one {minutes} ({CORES[policy['threads']]})" if policy and train else NOT_YET,
+         "skill policy of the Ant, Fig 5",
          f"tracking error {error} open loop, {closed} closed loop" if policy else NOT_YET],
         ["`python 04_mpc_maze.py`", f"{float(text[1]) / (60 if text[2] == 's' else 1):.1f}" if text else NOT_YET,
          "mazes, Fig 3, 6, 8, 14, 17, GIFs", "dense, closed loop: {:.1f} and {:.1f} m from the goal".format(*ends) if len(ends) == 2 else NOT_YET]])
@@ -521,6 +522,10 @@ def full_ablations():
     return ablations.table(results("ablations")) or markdown([], [], "Ablations are", "python tests/ablations.py FOLDER")
 
 
+def closed_loops():
+    return ablations.closed_table(results("closed_loop")) or markdown([], [], "The closed loop's parts are", "python tests/ablations.py closed")
+
+
 def pictures():
     lines = [f"![{path.stem}](../figures/{path.name})" for path in sorted((ROOT / "figures").glob("*.png"))]
     return "\n\n".join(lines).splitlines() or markdown([], [], "Figures are", "python 02_train_wetvae.py")
@@ -542,6 +547,8 @@ SECTIONS = [
      "and in brackets the difference to `shipped` in units of the difference between `shipped`'s two seeds. Slowest, fastest skill: "
      "executed / predicted distance in open loop. Maze 1: dense reward, mode `commands`, N = 1000, 20 trials.",
      full_ablations),
+    ("Parts of the closed loop: closed_loop.csv", "The shipped policies, executed with other laws of the closed loop (common.py, "
+     "`closed_loop`), without training anew.", closed_loops),
     ("Mazes (04): mazes.csv", "Intervals of all planning tables: 95 % bootstrap over policies and trials of each; with one "
      "policy they say nothing about the next one.", lambda: full_planning("mazes")),
     ("Mazes, each policy", "", lambda: full_planning("mazes", ("policy_seed",))),

@@ -12,7 +12,8 @@ import common
 import numpy as np
 import pytest
 import report
-from conftest import ROOT, tiny
+import torch
+from conftest import ROOT, load_policy, tiny
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 RESULTS = sorted((ROOT / "results").glob("*.csv"))
@@ -383,19 +384,26 @@ def ablation(name, seed, **numbers):
     return {"without": name, "seed": seed} | dict.fromkeys(ablations.MEASURES, 0.5) | numbers
 
 
-def test_the_effect_of_a_departure_is_the_measure_that_moves_most(repo):
+def test_the_effect_of_a_departure_is_three_measures_and_the_one_that_moves_most(repo):
     assert ablations.effect("discount", report.results) == ablations.NOT_YET
+    repo.write("ablations", [ablation("discount", 7)])
+    assert ablations.effect("discount", report.results) == ablations.NOT_YET  # there is nothing to compare it with
+    assert "missing" in ablations.table(repo.read("ablations"))[2]
     repo.write("ablations", [ablation("shipped", 0, tracking_error=0.14), ablation("shipped", 1, tracking_error=0.18),
-                             ablation("discount", 0, tracking_error=0.4, fall_rate=0.501), ablation("discount", 1, tracking_error=0.5),
-                             ablation("rate", 1, tracking_error=0.19), ablation("hidden", 7)])
-    assert ablations.effect("discount", report.results) == "tracking error, open loop: 0.45 instead of 0.16"
-    assert ablations.effect("rate", report.results) == "no measure moves by more than a fifth, or than two seeds differ"
-    assert ablations.effect("hidden", report.results) == ablations.effect("unheard", report.results) == ablations.NOT_YET
+                             ablation("discount", 0, tracking_error=0.4, fall_rate=0.501, follow_p90_m=4, updates_per_second=10 ** 4),
+                             ablation("discount", 1, tracking_error=0.5, follow_p90_m=8), ablation("rate", 1, tracking_error=0.19)])
+    same = ablation("shipped", 0)
+    closed, falls, p90 = same["tracking_error_closed"], 100 * same["fall_rate"], same["follow_p90_m"]
+    text = f"0.45 / {closed:.2f}, {(50.1 + falls) / 2:.0f} %; 90 % of following errors, m, closed loop: 6.00 instead of {p90:.2f}"
+    assert ablations.effect("discount", report.results) == text
+    assert ablations.effect("rate", report.results) == f"0.19 / {closed:.2f}, {falls:.0f} %"
+    assert ablations.effect("shipped", report.results) == f"0.16 / {closed:.2f}, {falls:.0f} %"
+    assert ablations.effect("unheard", report.results) == ablations.NOT_YET
     lines = ablations.table(repo.read("ablations"))
     assert len({line.count("|") for line in lines}) == 1 and lines[2].startswith("| `shipped` | 2 | 0.16 |")
-    assert "| 0.45 (+7.3) |" in lines[3] and "no seed in common" in lines[5]
-    text = report.made("| discount | <!-- without discount -->old<!-- / --> | 0.99 |")
-    assert text == "| discount | <!-- without discount -->tracking error, open loop: 0.45 instead of 0.16<!-- / --> | 0.99 |"
+    assert "| 0.45 (+7.3) |" in lines[3]
+    made = report.made("| discount | <!-- without discount -->old<!-- / --> | 0.99 |")
+    assert made == f"| discount | <!-- without discount -->{text}<!-- / --> | 0.99 |"
 
 
 def test_the_effect_of_a_departure_of_the_model_is_its_worst_seed(repo):
@@ -425,3 +433,23 @@ def test_ablations_are_measured_once(out, tmp_path, monkeypatch, capsys, s3, s4,
     ablations.main(tmp_path / "abl")
     assert "already" in capsys.readouterr().out
     assert common.read_csv(tmp_path / "results" / "ablations.csv") == [row]
+
+
+def test_parts_of_the_closed_loop(out, tmp_path, monkeypatch, s3, inside):
+    """Without feedback it is the open loop; as shipped, what 03 measures; what was changed is put back."""
+    assert inside(s3, *tiny(out, hidden=64)).returncode == 0
+    law = common.closed_loop
+    monkeypatch.setattr(ablations, "ROOT", tmp_path)
+    vars(s3).update(STARTS=4, NOISY=2, TRAVERSAL=3, SINGLE_RUN=(1, 4), MULTI_RUN=(2, 2))
+    ablations.closed_loops(s3, out, [0])
+    rows = {row["loop"]: row for row in common.read_csv(tmp_path / "results/closed_loop.csv")}
+    policy, error = load_policy(out, "ant_semi", 0), "tracking_error_closed"
+    assert float(rows["no feedback"][error]) == pytest.approx(s3.tracking(policy, False), rel=1e-4)
+    assert float(rows["as shipped"][error]) == pytest.approx(s3.tracking(policy, True), rel=1e-4)
+    assert len({row[error] for row in rows.values()}) > 3 and common.closed_loop is law
+    assert ablations.closed_table(list(rows.values()))[2].startswith("| as shipped | ")
+    c, far = torch.tensor([[0.0, 0.0], [1.0, 0.0]]), torch.full((2, 2), 0.01)
+    robots = SimpleNamespace(place=lambda: torch.zeros(2, 2))
+    slow, fast = ablations.same_share(c, far, robots, 0.1) - c
+    assert torch.allclose(slow, fast) and torch.allclose(law(c, far, robots, 0.1)[1] - c[1], fast)
+    assert torch.allclose(law(c, far, robots, 0.1)[0] - c[0], 2 * slow)
