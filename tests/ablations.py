@@ -13,11 +13,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import torch
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 import common  # noqa: E402
 
+torch.set_num_threads(1)  # the tensors are small: threads only wait for one another
 NOT_YET = "not measured yet"
 MEASURES = {  # column -> in words, format, factor
     "tracking_error": ("tracking error, open loop", ".2f", 1), "tracking_error_closed": ("tracking error, closed loop", ".2f", 1),
