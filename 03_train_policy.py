@@ -30,7 +30,7 @@ THREADS: Count = 2            # CPU threads; 1: updates wait for the robots' ste
 DECODER: str = "main"         # model of 02 whose decoder is the reward
 ROBOT: str = "ant"            # ant or half_cheetah
 STEP_SCALE: Positive = 0.1    # metres per trajectory unit, App. A.1.3: 1/10, Half-Cheetah 1/5
-VARIANCE_SCALE: Positive = 0.003  # decoder variance -> square metres (the paper: 0.05; fast skills then lag)
+VARIANCE_SCALE: Positive = 0.003  # decoder variance -> square metres (the paper: 0.05)
 BASE_FRAME: bool = True       # networks read state and command in the base frame (the paper: false)
 
 UPDATES: Count = 100_000      # updates of the critics (the paper: 1,920,000)
