@@ -7,6 +7,7 @@ import argparse
 import contextlib
 import csv
 import ctypes.util
+import decimal
 import hashlib
 import io
 import json
@@ -31,9 +32,9 @@ from mujoco.batch import Batch
 from torch import nn
 from torch.utils._pytree import tree_leaves
 
-# Types of constants: least, most, in words. Floats are exact for whole numbers up to 2 ** 53
-Whole = Annotated[int, 0, 2 ** 53, "a whole number of at least 0, at most 2 ** 53"]  # what int means here
-Count = Annotated[int, 1, 2 ** 53, "a whole number of at least 1"]
+# Types of constants: least, most, in words
+Whole = Annotated[int, 0, 2 ** 63 - 1, "a whole number of at least 0, below 2 ** 63"]  # what int means here
+Count = Annotated[int, 1, 2 ** 63 - 1, "a whole number of at least 1"]
 Number = Annotated[float, 0, 1e300, "a number of at least 0"]  # what float means here
 Positive = Annotated[float, 1e-300, 1e300, "a number above 0"]
 Signed = Annotated[float, -1e300, 1e300, "a number"]
@@ -336,9 +337,9 @@ def convert(value, kind, name):
     words = "true or false"
     if kind is not bool:
         base, least, most, words = get_args({int: Whole, float: Number}.get(kind, kind))
-        with contextlib.suppress(ValueError):
-            number = float(text)
-            if least <= number <= most and number == base(number):
+        with contextlib.suppress(decimal.InvalidOperation):  # exact: a float would round a long seed
+            number = decimal.Decimal(text)
+            if number.is_finite() and least <= number <= most and not (base is int and number % 1):
                 return base(number)
     stop(f"{name} is {value!r}, but must be {words}")
 

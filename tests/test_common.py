@@ -79,7 +79,7 @@ def test_flags_override_rows_and_rows_override_constants(flags):
     ("SHARE", "1 / 4", 0.25), ("WEIGHT", "20", 20.0), ("WEIGHT", "0", 0.0), ("RATE", "3", 3.0), ("ANGLE", "180", 180.0),
     ("FLAG", "1", True), ("FLAG", "'false'", False), ("START", "(1, -2)", (1.0, -2.0)), ("START", "[1e1, 2]", (10.0, 2.0)),
     ("MANY", "5", (5,)), ("MANY", "1e2", (100,)), ("MANY", "(1, 2.0, 3e0)", (1, 2, 3)), ("MANY", "'4 5'", (4, 5)),
-    ("WORDS", "'x'", "x"), ("WORDS", "''", ""), ("SEED", "20260101123456", 20260101123456), ("SEED", "2.0", 2)])
+    ("WORDS", "'x'", "x"), ("WORDS", "''", ""), ("SEED", "20260101123456789", 20260101123456789), ("SEED", "2.0", 2)])
 def test_a_file_says_a_value_in_any_notation(flags, name, written, value):
     config = flags(**{name: written})[1]
     assert config[name] == value and type(config[name]) is type(value)
@@ -95,12 +95,12 @@ def test_a_flag_may_be_a_fraction_where_the_file_says_a_whole_number(flags, name
     assert config[name] == value and type(config[name]) is type(value)
 
 
-def test_whole_numbers_are_exact_up_to_2_to_the_53(flags):
-    for seed in (123456789012345, 2 ** 53 - 1, 2 ** 53):
+def test_whole_numbers_are_exact_up_to_2_to_the_63(flags):
+    for seed in (1234567890123456789, 2 ** 53 + 1, 2 ** 63 - 1):
         assert flags("--seed", str(seed))[1]["SEED"] == flags(SEED=str(seed))[1]["SEED"] == seed
-    for seed in (2 ** 53 + 2, 10 ** 19, 10 ** 400):
+    for seed in (2 ** 63, 10 ** 19, 10 ** 400):
         error = flags("--seed", str(seed))
-        assert "at most 2 ** 53" in error and len(error.splitlines()) == 1
+        assert "below 2 ** 63" in error and len(error.splitlines()) == 1
         assert len(flags(N=f"10 ** {len(str(seed))}").splitlines()) == 1
     assert len(flags("--seed", "1e999999999999").splitlines()) == 1
 
@@ -209,7 +209,7 @@ def test_a_constant_may_be_written_without_a_type_without_blanks_and_twice(edite
     (("LENGTH: Count = 5", "LENGTH: Count = None"), (), "--length is None, but must be a whole number of at least 1"),
     (("SPEED_LOW: Signed = 0.0", "SPEED_LOW: Signed = '0,1'"), (), "--speed_low is '0,1', but must be a number"),
     ((), ("--trajectories", "1e12"), "lower --trajectories or --length"), ((), ("--length", "1e9"), "lower --trajectories"),
-    ((), ("--seed", "1e20"), "--seed is '1e20', but must be a whole number of at least 0, at most 2 ** 53")])
+    ((), ("--seed", "1e20"), "--seed is '1e20', but must be a whole number of at least 0, below 2 ** 63")])
 def test_an_edit_that_makes_no_sense_is_one_line(edited, changes, flags, message):
     done = edited(*changes)(*flags)
     assert one_line(done, 2) and message in done.stderr, done.stderr
