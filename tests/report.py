@@ -544,7 +544,7 @@ SECTIONS = [
      "closed loop. Pairs of numbers are open loop / closed loop. Speed: over the prior, WEDIS over the planner's range. Purity: of "
      "executed skills.", full_policies),
     ("Without each departure: ablations.csv", "Policies with one thing set back to the paper's value, 50,000 updates: mean of the seeds, "
-     "and in brackets the difference to `shipped` in units of the difference between `shipped`'s two seeds. Slowest, fastest skill: "
+     "and in brackets, if `shipped` has two seeds, the difference to it in units of what these two differ by. Slowest, fastest skill: "
      "executed / predicted distance in open loop. Maze 1: dense reward, mode `commands`, N = 1000, 20 trials.",
      full_ablations),
     ("Parts of the closed loop: closed_loop.csv", "The shipped policies, executed with other laws of the closed loop (common.py, "
