@@ -45,7 +45,7 @@ PRINTED = dict(OWN_AXIS=False, BETA_WARM_UP=0)  # Eq. 4 as printed; mixes axes w
 POLAR = dict(DATA="polar", LABELS="speed direction")
 LINE = dict(DATA="speed_acc", LABELS="speed acceleration", EPOCHS=24, BETA=4, Z_RANGE=1)
 FOUR = dict(DATA="four_factors", LABELS="speed direction curvature acceleration", EPOCHS=60, BETA=4)
-WEIGHTS = ((9, 0), (9, 1), (1, 10), (3, 10), (9, 10))  # beta and gamma in Fig 10
+WEIGHTS = ((9, 0), (9, 1), (1, 10), (3, 10), (9, 10))  # beta and gamma of our Fig 10
 MODELS = {  # a row names the constants, from DATA to Z_RANGE, in which a model differs
     "main": {}, "main_none": NONE, "full": dict(DATA="full"), "four_factors": FOUR,
     "polar": POLAR, "polar_cartesian": POLAR | dict(LABELS="x y"),
@@ -74,7 +74,7 @@ class Encoder(nn.Module):
         self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2 * z_dim))
 
     def forward(self, x, one_hot):
-        """x (B, T, x_dim), labels one_hot (B, y_dim), side by side -> mean, log-variance (B, z_dim) each."""
+        """x (B, T, x_dim), labels one_hot (B, all classes) -> mean, log-variance (B, z_dim) each."""
         state = None
         for displacement in x.unbind(1):
             state = self.cell(torch.cat([displacement, one_hot], 1), state)  # labels at each step, App. A.1.2
@@ -115,7 +115,7 @@ def objective(encoder, decoder, label_decoders, x, one_hot, y):
     """The three terms of Eq. 3 and 4: sums over time, dimensions and labels, means over the batch.
     x (B, T, x_dim) displacements; the labels as one_hot (B, y_dim), side by side, and as classes y (B, M)."""
     mean, log_var = encoder(x, one_hot)
-    z = mean + torch.randn_like(mean) * (0.5 * log_var).exp()  # z ~ q(z | tau, y): latents, not yet axes
+    z = mean + torch.randn_like(mean) * (0.5 * log_var).exp()  # z ~ q(z | tau, y), in latents' order
     # sum_t log p(s_t | s_1:t-1, z); in place of s_1:t-1 the decoder reads its own means
     log_p_tau = log_normal(x, *decoder.decode_latents(z, x.shape[1])).sum((1, 2)).mean()
     logits = label_decoders(z)
@@ -146,17 +146,17 @@ def train(x, one_hot, y, names, hyper):
     encoder = Encoder(x.shape[2], one_hot.shape[1], len(names), hyper.hidden)
     decoder = Decoder(len(names), x.shape[2], hyper.hidden)
     label_decoders = LabelDecoders(names if hyper.labelled else [], len(names), hyper.hidden, hyper.own_axis)
-    networks = nn.ModuleList([encoder, decoder, label_decoders])
+    networks = nn.ModuleList([encoder, decoder, label_decoders])  # Alg. 1: initialize phi, theta
     optimizer = torch.optim.Adam(networks.parameters(), fused=True)
     updates = len(x) // hyper.batch  # of an epoch; the few trajectories left are skipped
     for epoch in range(hyper.epochs):
         for i, rows in enumerate(torch.randperm(len(x)).split(hyper.batch)[:updates]):  # Alg. 1: B ~ D
-            log_p_tau, log_p_y, kl = objective(*networks, x[rows], one_hot[rows], y[rows])
+            log_p_tau, log_p_y, kl = objective(*networks, x[rows], one_hot[rows], y[rows])  # y: supervision
             progress = (epoch + i / updates) / hyper.epochs
             beta = hyper.beta
             if progress < hyper.beta_warm_up:
                 beta *= progress / hyper.beta_warm_up
-            loss = -(log_p_tau + hyper.gamma * log_p_y - beta * kl)  # Eq. 4
+            loss = -(log_p_tau + hyper.gamma * log_p_y - beta * kl)  # Eq. 4; Alg. 1: optimize phi, theta
             optimizer.param_groups[0]["lr"] = hyper.learning_rate * (1 - progress)
             optimizer.zero_grad()
             loss.backward()
@@ -188,17 +188,17 @@ def check_factors(decoder, names, steps):
 @torch.no_grad()
 def find_relation(decoder, names, steps, z_range):
     """Alg. 1, "Test: find relation functions", from the decoder alone (the paper: by hand, after the policy).
-    For each factor of z_multi: the weight with which a chain of single steps (common.next_skill) is nearest
-    to the free run, the decoder's `steps` transitions for the whole z, over a grid from -z_range to z_range.
-    The error: RMS difference / RMS displacement. Returns {factor: weight}."""
+    For each factor of z_multi: the weight in [-1, 1] with which single steps, chained by common.next_skill,
+    come nearest to the free run, one decoder run of `steps` transitions with all of z. Both run for each
+    skill of a 13 x 13 grid of speed and factor. Error: RMS difference / RMS displacement. {factor: weight}"""
     grid, relation = torch.linspace(-z_range, z_range, 13), {}
     for factor in [name for name in names if MULTI.get(name) in names]:
         z = torch.zeros(len(grid) ** 2, len(names))  # direction 0: a turn stays within the data's directions
         z[:, [0, names.index(factor)]] = torch.cartesian_prod(grid, grid)  # the first axis is the speed
         free_run, errors = decoder(z, steps)[0], {}
         for weight in sorted(np.linspace(-1, 1, 401).round(4).tolist(), key=abs):  # small ones win ties
-            policy = SimpleNamespace(method="wedis", decoder=decoder, names=names, relation={factor: weight})
-            chain = commands_of(policy, z, steps)
+            skills = SimpleNamespace(method="wedis", decoder=decoder, names=names, relation={factor: weight})
+            chain = commands_of(skills, z, steps)
             errors[weight] = ((chain - free_run).square().mean() / free_run.square().mean()).sqrt().item()
         best = relation[factor] = min(errors, key=errors.get)
         print(f"relation function of {factor}: weight {best:+.3f}, {errors[best]:.1%} from the decoder's "

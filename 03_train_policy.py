@@ -29,34 +29,30 @@ THREADS: Count = 2            # CPU threads; 1: updates wait for the robots' ste
 
 DECODER: str = "main"         # model of 02 whose decoder is the reward
 ROBOT: str = "ant"            # ant or half_cheetah
-STEP_SCALE: Positive = 0.1    # metres per trajectory unit, App. A.1.3: 1/10, Half-Cheetah 1/5
-VARIANCE_SCALE: Positive = 0.003  # decoder variance -> square metres (the paper: 0.05)
+STEP_SCALE: Positive = 0.1    # metres a step per trajectory unit, App. A.1.3: 1/10, Half-Cheetah 1/5
 BASE_FRAME: bool = True       # networks read state and command in the base frame (the paper: false)
 
 UPDATES: Count = 100_000      # updates of the critics (the paper: 1,920,000)
 ROBOTS: Count = 256           # robots that step together
-EPISODE: Count = 200          # steps until a robot starts anew; no terminal state: the value goes on
+EPISODE: Count = 200          # steps until a robot starts anew; for the critics an episode has no end
 SKILL_STEPS: Count = 25       # steps until a robot is given a new skill
 WARM_UP: Count = 10_000       # steps, of all robots together, with random actions; they normalise the state
 REPLAY: Count = 1_000_000     # steps, of all robots together, in the replay buffer R
 UPDATES_PER_STEP: Count = 8   # updates each time that all robots make a step
 BATCH: Count = 256            # App. A.1.3
 RELABELLED: Share = 0.5       # share of a batch that is relabelled with a fresh skill (the paper: 0)
-CORRECTED: Share = 0.25       # share of skills with a random correction, as in closed loop (the paper: 0)
 
 HIDDEN: Count = 256           # width of both hidden layers (the paper: 512; Half-Cheetah 256)
 LEARNING_RATE: Positive = 1e-3  # of Adam (the paper: 0.0003, fixed)
-DECAY_FROM: Share = 0.5       # share of the updates after which it falls linearly to 0 (the paper: 1)
+DECAY_FROM: Share = 0.5       # share of the updates after which it falls, linearly to 0 (the paper: 1)
 ACTOR_EVERY: Count = 2        # updates of the critics for each one of actor, value, target (the paper: 1)
-AVERAGED: Share = 0.002       # rate of the actor's running average, which is the policy (the paper: 1; or 0)
-DISCOUNT: Share = 0.98        # gamma of Eq. 1 (the paper: 0.99)
+AVERAGED: Share = 0.002       # rate of the actor's running average, the policy; 0: none (the paper: 0)
+DISCOUNT: Share = 0.99        # gamma of Eq. 1
 SMOOTHING: Share = 0.01       # of the target value network, App. A.1.3
 REWARD_SCALE: float = 0.1     # of Eq. 6 (the paper: 1)
 TEMPERATURE: float = 0.003    # alpha, weight of the entropy (the paper: 0.01, that is 0.001 at our scale)
 FLOOR_START: float = 0.04     # metres, least deviation in the reward; started at 0.01, robots stand still
-FLOOR_END: float = 0.01       # what it shrinks to, geometrically: now slow skills are learnt (the paper: 0)
-FLOOR_FROM: Share = 0.15      # share of the updates after which it shrinks
-FLOOR_UNTIL: Share = 0.6      # share of the updates at which it reaches FLOOR_END
+FLOOR_END: float = 0.01       # what it shrinks to until DECAY_FROM, geometrically (the paper: 0)
 
 # Baselines only
 METHOD: str = "wedis"         # wedis, or a baseline: dads or sectar
@@ -80,37 +76,29 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs
     "ant_semi": dict(FIGURE="fig05_skills_wedis"),
     "ant_full": dict(DECODER="full", FIGURE="fig15_full_circle"),
     "half_cheetah": dict(DECODER="speed_acc", ROBOT="half_cheetah", STEP_SCALE=0.2, BASE_FRAME=False,
-                         VARIANCE_SCALE=0.05, ROBOTS=64, SKILL_STEPS=100, CORRECTED=0.5, DISCOUNT=0.97,
-                         Z_RANGE=1.0, MULTI_RUN=(6, 20), FIGURE="fig16_half_cheetah"),
+                         ROBOTS=64, SKILL_STEPS=100, DISCOUNT=0.97, Z_RANGE=1.0, MULTI_RUN=(6, 20),
+                         FIGURE="fig16_half_cheetah"),
     "ant_world_frame": dict(BASE_FRAME=False),  # the paper's frame
     "ant_dads": dict(METHOD="dads", Z_RANGE=1.0, SKILL_STEPS=200, REWARD_SCALE=1.0, DISCOUNT=0.995,
                      MULTI_RUN=(1, 200), FIGURE="fig05_skills_dads"),
     "ant_sectar": dict(METHOD="sectar", UPDATES=30_000, Z_DIM=8, SKILL_STEPS=50, RECENT=512_000,
-                       MODEL_BATCH=128, REWARD_SCALE=1.0, SINGLE_RUN=(50, 1), MULTI_RUN=(50, 1),
-                       FIGURE="fig05_skills_sectar"),  # longer is worse
+                       MODEL_BATCH=128, REWARD_SCALE=1.0, DISCOUNT=0.98, SINGLE_RUN=(50, 1),
+                       MULTI_RUN=(50, 1), FIGURE="fig05_skills_sectar"),  # longer is worse
 }
 MAY_DIFFER = (  # between a policy, or a checkpoint, and the run that uses it
     "OUT TRAIN RESUME THREADS REPORTS UPDATES Z_RANGE SINGLE_RUN MULTI_RUN TRAVERSAL NOISY STARTS FIGURE "
-    "FEEDBACK CLASSES").split()
+    "FEEDBACK CORRECTION CLASSES").split()
 
 
 # -------- Eq. 5 in the form of Eq. 6, and Algorithm 1, policy training
 
 def reward(c, log_var, displacement, floor):
-    """REWARD_SCALE * log p_theta(s_t+1 | s_t, z), Eq. 6, (B,), less its normaliser, which no action changes,
-    and around c, the decoder's mean and a correction; the entropy of Eq. 6 is in Sac.update. c, log_var
-    (B, 2 or 1): trajectory units; displacement (B, 2 or 1), s_t+1 - s_t of Eq. 6, and floor: metres. At the
-    end of the Ant's training four fifths of the standard deviations are on the floor, 1 cm; if both are,
-    r = -REWARD_SCALE |displacement - STEP_SCALE c|^2 / (2 floor^2)."""
-    variance = (VARIANCE_SCALE * log_var.exp()).clamp(min=floor ** 2)
+    """REWARD_SCALE * log p_theta(s_t+1 | s_t, z), Eq. 6, (B,), less its normaliser, which no action changes.
+    c, the command, and log_var (B, 2 or 1): the decoder's mean and log-variance, trajectory units;
+    displacement (B, 2 or 1), s_t+1 - s_t of Eq. 6, whose s is the place alone, and floor: metres."""
+    variance = STEP_SCALE ** 2 * log_var.exp()  # square metres (the paper: 1/20 instead of the square)
+    variance = variance.clamp(min=floor ** 2)  # without a floor at first, robots learn to stand still
     return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * c) ** 2 / variance).sum(1)
-
-
-def random_corrections(n, x_dim):
-    """Random corrections of commands, (n, x_dim): 0, but with probability CORRECTED uniform in a disc of
-    radius common.CORRECTION (in one dimension: the lengths of such points, with either sign)."""
-    length = common.CORRECTION * torch.rand(n, 1).sqrt() * (torch.rand(n, 1) < CORRECTED)
-    return length * nn.functional.normalize(torch.randn(n, x_dim))
 
 
 def train_wedis(decoder, names):
@@ -121,20 +109,18 @@ def train_wedis(decoder, names):
     m2 = len(names) - m1  # M_2
     robots, rng, submit = start_robots()
     s_dim, a_dim = robots.observe().shape[1], robots.ctrl.shape[1]
-    sac = Sac(s_dim, x_dim, a_dim)
-    replay = Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=x_dim, z_single=m1, correction=x_dim)
-    log = Log(make_policy(sac, decoder, names, STEP_SCALE), robots, rng, replay, sac)  # it can resume
-    skills = replay.latest(ROBOTS)  # zeros, or what Log has restored
-    z_single, correction = skills.z_single, skills.correction
+    sac = Sac(s_dim, x_dim, a_dim)  # Alg. 1: initialize psi, psi bar, psi hat
+    replay = Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=x_dim, z_single=m1)
+    # With --resume true, Log puts back the robots, replay and sac of the last checkpoint
+    log = Log(make_policy(sac, decoder, names, STEP_SCALE), robots, rng, replay, sac)
+    z_single = replay.latest(ROBOTS).z_single  # zeros at first, until a robot's skill is over
 
     while sac.updates < UPDATES:
         # Alg. 1: sample z_single from the prior, for the robots whose skill is over; set z = (z_single, 0)
         over = robots.age() % SKILL_STEPS == 0                                       # (n, 1)
-        correction = torch.where(over, random_corrections(ROBOTS, x_dim), correction)  # (n, 2)
         z_single = torch.where(over, torch.randn(ROBOTS, m1), z_single)              # (n, 2)
         z = torch.cat([z_single, torch.zeros(ROBOTS, m2)], 1)                        # (n, 3)
-        mean = decoder(z, 1)[0][:, 0]                                                # (n, 2), world frame
-        c = mean + correction                                                        # (n, 2), the command
+        c = decoder(z, 1)[0][:, 0]  # the command: one step from rest, trajectory units; (n, 2)
 
         # Alg. 1: execute actions a ~ pi(a | s, z_single), here pi(a | s, c); a second core steps the robots
         s = robots.observe()                                                         # (n, 27)
@@ -149,41 +135,33 @@ def train_wedis(decoder, names):
             # Alg. 1: sample a batch of transitions. Relabelling: any step can be judged by any skill
             batch = replay.sample(UPDATES_PER_STEP * BATCH)                          # (B, ..) each
             fresh = torch.rand(len(batch.s), 1) < RELABELLED                         # (B, 1)
-            batch.correction = torch.where(fresh, random_corrections(len(fresh), x_dim), batch.correction)
             batch.z_single = torch.where(fresh, torch.randn(len(fresh), m1), batch.z_single)
             z = torch.cat([batch.z_single, torch.zeros(len(fresh), m2)], 1)          # (B, 3)
 
-            # Alg. 1: compute the reward r = log p_theta(s_t+1 | s_t, z), Eq. 6; z, mean, c of the batch
-            mean, log_var = (out[:, 0] for out in decoder(z, 1))                     # (B, 2) each
-            floor = floor_at(sac.updates / UPDATES)
-            c = mean + batch.correction                                              # (B, 2)
+            # Alg. 1: compute the reward r = log p_theta(s_t+1 | s_t, z), Eq. 6
+            c, log_var = (out[:, 0] for out in decoder(z, 1))                        # (B, 2) each
+            shrunk = min(1, sac.updates / max(DECAY_FROM * UPDATES, 1))              # from 0 to 1
+            floor = FLOOR_START ** (1 - shrunk) * FLOOR_END ** shrunk                # metres
             r = reward(c, log_var, batch.displacement, floor)                        # (B,)
-            on_floor = (VARIANCE_SCALE * log_var.exp() < floor ** 2).float().mean()
+            on_floor = (STEP_SCALE ** 2 * log_var.exp() < floor ** 2).float().mean()
 
-            # Alg. 1: optimize psi, psi bar, psi hat with the SAC, BATCH steps at a time. The second c, that
-            # of the next step, is the same: as if no skill ended
-            losses = sac.learn(batch, c, c, r)
+            # Alg. 1: optimize psi, psi bar, psi hat with the SAC, BATCH steps at a time
+            losses = sac.learn(batch, c, c, r)  # the same command after the step, as if no skill ended
             log.numbers = losses | dict(reward=r.mean(), on_floor=on_floor)
 
         # Alg. 1: collect the samples in the replay buffer R (after the updates, which ran meanwhile)
         displacement, unstable = physics.result()                                    # (n, 2) metres, (n,)
-        replay.add(unstable, s=s, a=a, s2=robots.observe(), displacement=displacement, z_single=z_single,
-                   correction=correction)
+        replay.add(unstable, s=s, a=a, s2=robots.observe(), displacement=displacement, z_single=z_single)
         robots.reset(np.flatnonzero((robots.age()[:, 0].numpy() >= EPISODE) | unstable), rng)
         log.step()
     return log.policy
 
 
-def floor_at(progress):
-    """The least deviation in the reward, metres, when a share `progress` of the training is done."""
-    shrunk = min(1, max(0, (progress - FLOOR_FROM) / max(FLOOR_UNTIL - FLOOR_FROM, 1e-9)))
-    return FLOOR_START ** (1 - shrunk) * FLOOR_END ** shrunk
-
-
 # -------- SAC (Haarnoja et al. 2017), App. A.1.3
 
 class Sac(nn.Module):
-    """Actor psi, twin critics (psi bar), value (psi hat) and target network, with a fixed temperature.
+    """Actor psi, twin critics (psi bar; Alg. 1 names one), value (psi hat) and its target network, with a
+    fixed temperature.
     average: the policy, a running average of the actor's weights."""
 
     def __init__(self, s_dim, c_dim, a_dim):
@@ -199,7 +177,7 @@ class Sac(nn.Module):
         self.updates, self.losses = 0, {}
 
     def normalise(self, s):
-        """Fix the mean and deviation of the state, once, from random steps s (N, s_dim), clamped to +-10."""
+        """Fix the mean and deviation of the state, once, from random steps s (N, s_dim)."""
         x = self.actor.inputs(s, torch.zeros(len(s), self.actor.arguments[1]))[:, :len(self.actor.s_mean)]
         self.actor.s_mean.copy_(x.mean(0))
         self.actor.s_std.copy_(x.std(0, correction=0).clamp(min=1e-3))
@@ -217,8 +195,8 @@ class Sac(nn.Module):
         return self.losses
 
     def update(self, x, a, x2, r):
-        """One update; no step is terminal. x, x2 (b, n): Actor.inputs before and after the step; a (b, m);
-        r (b,)."""
+        """One update; no step is terminal. x, x2 (BATCH, 26 + 2): Actor.inputs before and after the step; a
+        (BATCH, 8); r (BATCH,)."""
         with torch.no_grad():
             q_target = r + DISCOUNT * self.target(x2).squeeze(1)
         q1, q2 = (critic(torch.cat([x, a], 1)).squeeze(1) for critic in self.critics)
@@ -235,7 +213,7 @@ class Sac(nn.Module):
         q1, q2 = (critic(torch.cat([x, a_new], 1)).squeeze(1) for critic in self.critics)
         q_new = torch.minimum(q1, q2)
         self.critics.requires_grad_(True)
-        actor_loss = (TEMPERATURE * log_prob - q_new).mean()  # -log_prob: the entropy of Eq. 6, by action
+        actor_loss = (TEMPERATURE * log_prob - q_new).mean()  # for Eq. 6's entropy: of actions
         v_loss = 0.5 * ((self.value(x).squeeze(1) - (q_new - TEMPERATURE * log_prob).detach()) ** 2).mean()
         self.actor_adam.zero_grad()
         (actor_loss + v_loss).backward()  # one backward for both: they share no parameter
@@ -258,7 +236,7 @@ def main():
         torch.manual_seed(SEED)
         train = dict(wedis=train_wedis, dads=train_dads, sectar=train_sectar)[METHOD]
         policy = train(source["decoder"], source["names"])
-        policy.relation = source["relation"]  # Alg. 1, "Test: find relation functions", in 02
+        policy.relation = source["relation"]  # Alg. 1 finds them here, by hand; 02 has, from the decoder
         common.save(OUT, "policy", EXPERIMENT, SEED, config, **vars(policy))  # before it is measured
     policy = SimpleNamespace(**common.load(OUT, "policy", EXPERIMENT, SEED, **made_with()))
     same_decoder(policy, source["decoder"])

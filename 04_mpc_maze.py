@@ -34,7 +34,7 @@ PORT: int = 8080          # of the page, on this machine alone; 0: the first fre
 METHOD: str = "wedis"     # rows of METHODS below
 MAZES: str = "maze1 maze2"  # rows of MAZE below
 REWARDS: str = "dense sparse"  # Sec. 6.2
-# printed: planned with one decoder run of T transitions; executed by sampled actions, without feedback.
+# printed: planned with one decoder run of T transitions; executed by sampled actions, its place not fed back.
 # commands: planned with what the robot is commanded. closed: as commands, with feedback and mean actions.
 MODES: str = "printed commands closed"  # one or more of the three
 POLICY: str = "ant_semi"  # experiment of 03
@@ -63,7 +63,7 @@ STUDY = dict(METHOD="wedis wedis_s wedis_nts dads dads_speed sectar", POLICY_SEE
 EXPERIMENTS = {  # a row names the constants in which an experiment differs; its name is that of its CSV
     "mazes": {},
     "figure7": STUDY | dict(SAMPLES=(10, 100, 1000, 10_000), DRAW="fig07"),  # stopped, it goes on
-    "matched": STUDY | dict(SAMPLES=1000, LOOK_AHEAD=(200, 600), DRAW=""),  # all look equally far ahead
+    "matched": STUDY | dict(SAMPLES=1000, LOOK_AHEAD=(200, 600), DRAW=""),  # all but DADS look so far
     "fig18": dict(MAZES="s_maze obstacles", REWARDS="dense", MODES="printed closed", POLICY_SEEDS=(0, 1, 2),
                   DRAW="fig18"),
     "drive": dict(DRIVE=True, MAZES="open", REWARDS="dense", MODES="commands"),
@@ -94,12 +94,13 @@ METHODS = {  # Table 2
 }
 
 # -------- Algorithm 2, Sec. 5; its lines are counted from "for i", each "end" is one
-# case: a Configuration (below), the constants of one run in lower case.
+# case: a Configuration (below), the constants of one run in lower case. policy: what 03 has saved, with
+# actor, decoder, names, relation, and scale, metres a step per trajectory unit.
 
 def plan_and_execute(case, policy, pool):
-    """Algorithm 2 for case.trials robots side by side; pool: of skill_pool. Returns their poses (H_E + 1,
-    trials, nq), and for each i z_1* (trials, M), the first skills of the best plans, and the paths of these
-    plans (trials, H_P T + 1, 2), metres."""
+    """Algorithm 2 for case.trials robots side by side; pool: of skill_pool. Returns their poses (steps + 1,
+    trials, nq), and a list with, for each i, the first skills z_1* of the best plans, (trials, M), and the
+    paths of these plans, (trials, horizon * T + 1, 2), metres."""
     robots = common.Robots(maze_spec(case), case.trials, THREADS)
     for n in range(case.trials):  # trial n of a policy starts alike for all methods, modes and mazes
         robots.reset([n], np.random.default_rng((case.seed, case.policy_seed, n)))
@@ -131,7 +132,7 @@ def plan(case, policy, pool, horizon, s0):
         path.append(state + policy.scale * case.hold * delta_j.cumsum(1))  # line 7
         state = path[-1][:, -1:]  # line 8
     path = torch.cat(path, 1)  # (N, H_P T + 1, 2)
-    # Sparse rewards are equal for all sequences that end within epsilon: argmax takes the first of them
+    # Sparse rewards tie (w_r if it arrives, else 0, without collisions): argmax takes the first, a random one
     best = planning_reward(path, case).argmax()  # lines 10 and 11
     return z[picked[best, 0]], path[best].clone()  # a copy: a view would keep all N paths in memory
 
@@ -150,13 +151,13 @@ def skill_pool(case, policy):
         if case.mode == "printed":
             delta.append(policy.decoder(part, case.length)[0])  # one run of T transitions with all of z
         else:
-            delta.append(commands_of(policy, part, case.length))  # the first step of T runs, one for each f^m
+            delta.append(commands_of(policy, part, case.length))  # first steps, chained by the f^m
     return z, torch.cat(delta)
 
 
 def planning_reward(path, case):
     """r_d or r_s, Sec. 6.2, of paths (N, H_P T + 1, 2), metres -> (N,): the task reward of the last state
-    (our choice: the paper does not say which states count) less w_p for each transition that collides."""
+    (the paper does not say which states count) less w_p for each transition (theirs: state) that collides."""
     distance = (path[:, -1] - torch.tensor(case.goal)).norm(dim=1)  # -r(s)
     penalty = case.penalty * collides(path, case.walls, case.radius).sum(1)
     if case.reward == "sparse":
@@ -210,7 +211,7 @@ def main():
 
 @dataclass(frozen=True)
 class Configuration:
-    """One plan-and-execute run. Each field is the constant of its name, for this run."""
+    """One run of plan_and_execute: one value of each constant, and the walls of its maze, metres."""
     method: str
     mode: str
     maze: str

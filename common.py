@@ -1,7 +1,8 @@
 """What two or more stages share: decoder, relation functions, weak labels, robots, actor, execution.
 
-Units: metres, radians, environment steps of 0.05 s. Decoder displacements are in trajectory units: the
-fastest transition of the data is 1. `scale` makes them metres a step (Ant 1/10, Half-Cheetah 1/5; A.1.3).
+Units: metres, radians, environment steps of 0.05 s. Decoder displacements are in trajectory units: 1 is the
+highest speed of the data. `scale` makes them metres a step (Ant 1/10, Half-Cheetah 1/5; A.1.3). The lines of
+Alg. 2 are counted from "for i"; each "end" is one.
 """
 import argparse
 import contextlib
@@ -60,7 +61,8 @@ def weak_labels(factors, names, ranges):
     labels = []
     for name in names:
         if name in MULTI:
-            # 0 zero, 1 positive, 2 negative: in A.1.1's example -10 degrees is class three
+            # 0 zero, 1 positive, 2 negative: in A.1.1's example -10 degrees is class three (its list,
+            # "straight, right, left", then counts angles clockwise)
             labels.append(np.sign(factors[name]).astype(int) % 3)
         else:
             labels.append(np.digitize(factors[name], np.linspace(*ranges[name], CLASSES[name] + 1)[1:-1]))
@@ -73,7 +75,7 @@ def weak_labels(factors, names, ranges):
 
 class Decoder(nn.Module):
     """p_theta(tau | z), Fig 1: an LSTM over z and its own last mean -> a Gaussian over the next displacement.
-    If it read the true last displacement, it would need no z, and z would stay entangled."""
+    If it read the true last displacement, it would need z for two steps only, and z would stay entangled."""
 
     def __init__(self, z_dim, x_dim, hidden):
         super().__init__()
@@ -84,7 +86,7 @@ class Decoder(nn.Module):
         self.register_buffer("axes", torch.eye(z_dim))  # z -> latents: a signed permutation, set in stage 02
 
     def forward(self, z, steps):
-        """Skills z (B, M): axis m is factor m, and + is more of it. Returns what decode_latents returns."""
+        """Skills z (B, M): axis m is factor m, and + is more of it. Means and log-variances as below."""
         return self.decode_latents(z @ self.axes, steps)
 
     def decode_latents(self, latents, steps):
@@ -220,7 +222,7 @@ class Actor(nn.Module):
         self.register_buffer("s_std", torch.ones(s_dim))
 
     def inputs(self, s, c):
-        """What all networks read, (B, n): state and command in the base frame, the state normalised."""
+        """What all networks read, (B, 26 + 2): state and command in the base frame, the state normalised."""
         if self.base_frame:
             s, c = to_base_frame(s, c)
         return torch.cat([((s - self.s_mean) / self.s_std).clamp(-10, 10), c], 1)
@@ -245,10 +247,8 @@ class Actor(nn.Module):
 # -------- execution of skills, Alg. 2, lines 13 to 16 and 19
 
 def closed_loop(c, reference, robots, scale):
-    """Commands (n, 2 or 1), trajectory units: c plus a share of reference - place (both in metres), up to
-    twice as large for slow commands, since slow skills would drift before they are corrected."""
-    share = FEEDBACK * (2 - c.norm(dim=1, keepdim=True).clamp(max=1))
-    correction = share * (reference - robots.place()) / scale
+    """Commands (n, 2 or 1), trajectory units: c plus a share of reference - place (both in metres)."""
+    correction = FEEDBACK * (reference - robots.place()) / scale
     size = correction.norm(dim=1, keepdim=True)
     return c + correction * (CORRECTION / size.clamp(min=max(CORRECTION, 1e-9)))  # 0 switches it off
 

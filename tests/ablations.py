@@ -80,16 +80,9 @@ def main(folder):
 
 # ---------------------------------------------------------------- parts of the closed loop, without training
 
-def same_share(c, reference, robots, scale):
-    """closed_loop as it would be if it corrected slow commands no more than fast ones."""
-    correction = common.FEEDBACK * (reference - robots.place()) / scale
-    size = correction.norm(dim=1, keepdim=True)
-    return c + correction * (common.CORRECTION / size.clamp(min=common.CORRECTION))
-
-
 LOOPS = {  # what differs in common.py
-    "as shipped": {}, "slow commands corrected no more": dict(closed_loop=same_share), "no limit": dict(CORRECTION=1e6),
-    "half the limit": dict(CORRECTION=0.1), "no feedback": dict(FEEDBACK=0.0)}
+    "as shipped": {}, "no limit": dict(CORRECTION=1e6), "half the limit": dict(CORRECTION=0.1),
+    "no feedback": dict(FEEDBACK=0.0)}
 
 
 def closed_loops(stage3, folder, seeds):

@@ -132,37 +132,10 @@ def test_log_probability_is_that_of_a_transformed_distribution():
 def test_reward_is_equation_6_up_to_its_maximum(s3):
     torch.manual_seed(0)
     mean, log_var, displacement = torch.randn(40, 2), torch.randn(40, 2), 0.1 * torch.randn(40, 2)
-    s3.VARIANCE_SCALE = 1 / 20  # App. A.1.3; without a floor, then with one above all deviations
-    for floor, std in ((0.0, (log_var.exp() / 20).sqrt()), (10.0, torch.full((40, 2), 10.0))):
+    for floor, std in ((0.0, (log_var / 2).exp() / 10), (10.0, torch.full((40, 2), 10.0))):  # none; above all deviations
         p = D.Independent(D.Normal(mean / 10, std), 1)
         expected = s3.REWARD_SCALE * (p.log_prob(displacement) - p.log_prob(mean / 10))
         torch.testing.assert_close(s3.reward(mean, log_var, displacement, floor), expected, **CLOSE)
-
-
-def test_the_floor_shrinks_geometrically_and_may_be_off(s3):
-    vars(s3).update(FLOOR_START=0.08, FLOOR_END=0.02, FLOOR_FROM=0.2, FLOOR_UNTIL=0.6)
-    for progress, floor in ((0, 0.08), (0.2, 0.08), (0.4, 0.04), (0.6, 0.02), (1, 0.02)):
-        assert s3.floor_at(progress) == pytest.approx(floor)
-    for start, end, floors in ((0.0, 0.0, (0, 0, 0)), (0.04, 0.0, (0.04, 0, 0)), (0.0, 0.01, (0, 0, 0.01))):
-        vars(s3).update(FLOOR_START=start, FLOOR_END=end)
-        assert [s3.floor_at(progress) for progress in (0.1, 0.4, 0.9)] == pytest.approx(floors)
-    vars(s3).update(FLOOR_START=0.04, FLOOR_END=0.01, FLOOR_FROM=0.5, FLOOR_UNTIL=0.5)  # at once
-    assert [s3.floor_at(progress) for progress in (0.5, 0.51)] == pytest.approx([0.04, 0.01])
-
-
-@pytest.mark.parametrize("x_dim", [2, 1])
-def test_a_share_of_random_corrections_is_uniform_in_a_disc(s3, x_dim):
-    torch.manual_seed(0)
-    s3.CORRECTED = 0.3
-    found = s3.random_corrections(40_000, x_dim)
-    size = found.norm(dim=1)
-    made = size > 0
-    assert made.float().mean().item() == pytest.approx(0.3, abs=0.01) and size.max() <= common.CORRECTION + 1e-6
-    assert (size[made] < common.CORRECTION / 2).float().mean().item() == pytest.approx(0.25, abs=0.02)  # of the area
-    assert found.mean(0).abs().max() < 0.01 and found.shape == (40_000, x_dim)
-    for changed in (dict(CORRECTED=0.0), dict(CORRECTED=1.0)):
-        vars(s3).update(changed)
-        assert (s3.random_corrections(50, x_dim).norm(dim=1) > 0).float().mean() == s3.CORRECTED
 
 
 def small_sac(s3, every):
@@ -254,7 +227,7 @@ def test_one_pass_of_alg_1_pays_equation_6(s3, monkeypatch):
     """Stored steps, a share of them relabelled, judged by torch.distributions; the commands before and after."""
     torch.manual_seed(0)
     vars(s3).update(ROBOTS=4, SKILL_STEPS=5, EPISODE=10, REPLAY=400, WARM_UP=10, UPDATES=8, HIDDEN=16, BATCH=600,
-                    UPDATES_PER_STEP=2, RELABELLED=0.4, CORRECTED=0.5, FLOOR_START=0.05, THREADS=1)
+                    UPDATES_PER_STEP=2, RELABELLED=0.4, FLOOR_START=0.05, THREADS=1)
     decoder = common.Decoder(3, 2, 16).requires_grad_(False)
     decoder.head[2].weight *= 5
 
@@ -262,7 +235,6 @@ def test_one_pass_of_alg_1_pays_equation_6(s3, monkeypatch):
         replay.added = 300
         replay.table[:300] = torch.randn(300, replay.table.shape[1])
         replay.read(slice(0, 300)).displacement.mul_(0.05)
-        replay.read(slice(0, 300)).correction.mul_(0.1)
     done = one_pass(s3, monkeypatch, lambda: s3.train_wedis(decoder, THREE), fill)
     stored, batch, n = done.stored, done.batch, 1200
     rows = (batch.s[:, None, 0] == stored.s[:, 0]).int().argmax(1)  # which of the stored steps these are
@@ -270,13 +242,10 @@ def test_one_pass_of_alg_1_pays_equation_6(s3, monkeypatch):
         assert torch.equal(vars(batch)[name], vars(stored)[name][rows])
     own = (batch.z_single == stored.z_single[rows]).all(1)
     assert own.float().mean().item() == pytest.approx(0.6, abs=0.05)
-    assert torch.equal(batch.correction[own], stored.correction[rows][own])
-    fresh = batch.correction[~own].norm(dim=1)
-    assert fresh.max() <= common.CORRECTION + 1e-6 and (fresh > 0).float().mean().item() == pytest.approx(0.5, abs=0.1)
     assert batch.z_single[~own].std(0).tolist() == pytest.approx([1, 1], abs=0.15)
     mean, log_var = (part[:, 0] for part in decoder(torch.cat([batch.z_single, torch.zeros(n, 1)], 1), 1))
-    assert torch.allclose(done.c, mean + batch.correction) and torch.equal(done.c, done.c2)
-    std = (0.5 * (s3.VARIANCE_SCALE * log_var.exp()).log()).exp().clamp(min=0.05)
+    assert torch.allclose(done.c, mean) and torch.equal(done.c, done.c2)
+    std = ((log_var / 2).exp() / 10).clamp(min=0.05)
     p = D.Independent(D.Normal(0.1 * done.c, std), 1)
     expected = s3.REWARD_SCALE * (p.log_prob(batch.displacement) - p.log_prob(0.1 * done.c))
     torch.testing.assert_close(done.r, expected, atol=1e-4, rtol=1e-3)
@@ -284,11 +253,32 @@ def test_one_pass_of_alg_1_pays_equation_6(s3, monkeypatch):
     assert done.log.numbers["on_floor"] == pytest.approx((std == 0.05).float().mean().item(), abs=1e-3)
 
 
+@pytest.mark.parametrize("progress, decay_from, start, end, floor", [
+    (0, 0.5, 0.08, 0.02, 0.08), (0.25, 0.5, 0.08, 0.02, 0.04), (0.5, 0.5, 0.08, 0.02, 0.02), (0.9, 0.5, 0.08, 0.02, 0.02),
+    (0.5, 1, 0.08, 0.02, 0.04), (0.5, 0, 0.08, 0.02, 0.02), (0.3, 0.5, 0, 0, 0), (0.3, 0.5, 0.08, 0, 0), (0.9, 0.5, 0, 0.02, 0.02)])
+def test_the_floor_of_the_reward_shrinks_geometrically_and_may_be_off(progress, decay_from, start, end, floor, s3, monkeypatch):
+    torch.manual_seed(0)
+    vars(s3).update(ROBOTS=4, SKILL_STEPS=5, EPISODE=10, REPLAY=400, WARM_UP=10, UPDATES=1000, HIDDEN=16, BATCH=50,
+                    FLOOR_START=start, FLOOR_END=end, DECAY_FROM=decay_from, THREADS=1)
+    decoder = common.Decoder(3, 2, 16).requires_grad_(False)
+    decoder.head[2].bias[2:] = -6  # a deviation of 5 mm
+
+    def fill(replay):
+        replay.added = 300
+        replay.table[:300] = 0.05 * torch.randn(300, replay.table.shape[1])
+    done = one_pass(s3, monkeypatch, lambda: s3.train_wedis(decoder, THREE), fill,
+                    lambda log: setattr(log.sac, "updates", int(1000 * progress)))
+    _, log_var = decoder(torch.cat([done.batch.z_single, torch.zeros(400, 1)], 1), 1)
+    p = D.Independent(D.Normal(0.1 * done.c, ((log_var[:, 0] / 2).exp() / 10).clamp(min=floor)), 1)
+    expected = s3.REWARD_SCALE * (p.log_prob(done.batch.displacement) - p.log_prob(0.1 * done.c))
+    torch.testing.assert_close(done.r, expected, atol=1e-4, rtol=1e-3)
+
+
 @pytest.mark.parametrize("names, x_dim", [(THREE, 2), (["speed", "acceleration"], 1)])
-def test_robots_are_asked_for_single_steps_a_share_of_them_corrected(names, x_dim, s3, monkeypatch):
+def test_robots_are_asked_for_single_steps(names, x_dim, s3, monkeypatch):
     """The commands of 300 robots against the decoder's first means for (z_single, 0), at the first step and later."""
     torch.manual_seed(0)
-    vars(s3).update(ROBOTS=300, SKILL_STEPS=5, EPISODE=10, WARM_UP=10 ** 6, REPLAY=4500, HIDDEN=8, CORRECTED=0.3, THREADS=1)
+    vars(s3).update(ROBOTS=300, SKILL_STEPS=5, EPISODE=10, WARM_UP=10 ** 6, REPLAY=4500, HIDDEN=8, THREADS=1)
     if x_dim == 1:
         vars(s3).update(ROBOT="half_cheetah", BASE_FRAME=False)
     decoder, asked = common.Decoder(len(names), x_dim, 16).requires_grad_(False), []
@@ -299,10 +289,7 @@ def test_robots_are_asked_for_single_steps_a_share_of_them_corrected(names, x_di
     assert stored.z_single.shape == (12, 300, x_dim)
     for t, c in enumerate(asked):
         mean = decoder(nn.functional.pad(stored.z_single[t], (0, len(names) - x_dim)), 1)[0][:, 0]
-        torch.testing.assert_close(c, mean + stored.correction[t])
-    size = stored.correction[-1].norm(dim=1)
-    assert 0.95 * common.CORRECTION < size.max() <= common.CORRECTION + 1e-6
-    assert (size > 0).float().mean().item() == pytest.approx(0.3, abs=0.07)
+        torch.testing.assert_close(c, mean)
     assert stored.z_single[-1].std(0).tolist() == pytest.approx([1] * x_dim, abs=0.12)  # z_single from the prior
     renewed = (stored.z_single[1:] != stored.z_single[:-1]).any(2)  # each robot at a time of its own, every fifth step
     assert renewed[:5].sum(0).eq(1).all() and renewed[5:10].sum(0).eq(1).all()
@@ -488,10 +475,10 @@ def numbers(monkeypatch):
 
 
 @pytest.mark.parametrize("c, reference, expected", [
-    ((0.3, 0.0), (0.1, 0.0), (0.47, 0.0)),  # FEEDBACK 0.1, 1.7 times, of one trajectory unit
-    ((0.0, 0.0), (0.1, 0.0), (0.2, 0.0)),   # twice as much if the command is 0
-    ((2.5, 0.0), (0.0, 0.1), (2.5, 0.1)),   # never less than FEEDBACK
-    ((0.8, 0.0), (0.02, 0.0), (0.824, 0.0)),
+    ((0.3, 0.0), (0.1, 0.0), (0.4, 0.0)),   # FEEDBACK 0.1 of one trajectory unit
+    ((0.0, 0.0), (0.15, 0.0), (0.15, 0.0)),
+    ((2.5, 0.0), (0.0, 0.1), (2.5, 0.1)),
+    ((0.8, 0.0), (0.02, 0.0), (0.82, 0.0)),
     ((0.3, 0.0), (0.0, 5.0), (0.3, 0.2)),   # CORRECTION: at most 0.2
     ((3.0, 4.0), (0.0, 0.0), (3.0, 4.0))])  # where it should be, nothing changes
 def test_closed_loop_by_hand(c, reference, expected, numbers):
@@ -508,7 +495,7 @@ def test_execute_holds_commands_open_and_closed(numbers):
     torch.testing.assert_close(torch.cat(robots.asked), commands[0].repeat_interleave(3, 0))  # open loop: unchanged
     still = Fake(share=0.0)
     common.execute(policy, still, commands[:, :1], 3, True, True)
-    torch.testing.assert_close(torch.cat(still.asked)[:, 0], torch.tensor([0.5, 0.575, 0.65]))  # 0.5 behind a step
+    torch.testing.assert_close(torch.cat(still.asked)[:, 0], torch.tensor([0.5, 0.55, 0.6]))  # 0.5 behind a step
 
 
 OFF = [dict(), dict(CORRECTION=0.0), dict(FEEDBACK=0.0), dict(CORRECTION=0.0, FEEDBACK=0.0)]
@@ -525,7 +512,7 @@ def test_what_is_switched_off_is_off_and_commands_keep_their_direction(changed, 
     behind[:2] = 0
     found = common.closed_loop(torch.tensor(c).float(), torch.tensor(behind).float(), Fake(204), 0.1).numpy()
     for one, gap, ours in zip(c, behind, found):
-        gain = common.FEEDBACK * (2 - min(1, np.hypot(*one))) * gap / 0.1
+        gain = common.FEEDBACK * gap / 0.1
         if common.CORRECTION and np.hypot(*gain) > common.CORRECTION:
             gain *= common.CORRECTION / np.hypot(*gain)
         if not common.CORRECTION:  # off
@@ -625,13 +612,13 @@ def test_another_physics_is_another_policy(what, s3, inside, out, tree, monkeypa
     measured = {row["settings"] for row in common.read_csv(out / "results/policies.csv")}
     for flags in (["--train", "false"], ["--resume", "true"]):
         done = inside(s3, *tiny(out), *flags)
-        if what in ("FRAME_SKIP", "CORRECTION", "ant.xml"):
+        if what in ("FRAME_SKIP", "ant.xml"):
             assert one_line(done, 2) and f"made with {what} = " in done.stderr, done.stderr
         else:
             assert done.returncode == 0, done.stderr
     rows = common.read_csv(out / "results/policies.csv")
     assert len(measured) == 1 and rows[0]["settings"] in measured  # it stays
-    if what in ("FEEDBACK", "CLASSES"):
+    if what in ("FEEDBACK", "CORRECTION", "CLASSES"):
         assert rows[1]["settings"] not in measured
 
 

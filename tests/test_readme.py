@@ -12,7 +12,6 @@ import common
 import numpy as np
 import pytest
 import report
-import torch
 from conftest import ROOT, load_policy, tiny
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -448,8 +447,3 @@ def test_parts_of_the_closed_loop(out, tmp_path, monkeypatch, s3, inside):
     assert float(rows["as shipped"][error]) == pytest.approx(s3.tracking(policy, True), rel=1e-4)
     assert len({row[error] for row in rows.values()}) > 3 and common.closed_loop is law
     assert ablations.closed_table(list(rows.values()))[2].startswith("| as shipped | ")
-    c, far = torch.tensor([[0.0, 0.0], [1.0, 0.0]]), torch.full((2, 2), 0.01)
-    robots = SimpleNamespace(place=lambda: torch.zeros(2, 2))
-    slow, fast = ablations.same_share(c, far, robots, 0.1) - c
-    assert torch.allclose(slow, fast) and torch.allclose(law(c, far, robots, 0.1)[1] - c[1], fast)
-    assert torch.allclose(law(c, far, robots, 0.1)[0] - c[0], 2 * slow)
