@@ -439,6 +439,7 @@ def test_parts_of_the_closed_loop(out, tmp_path, monkeypatch, s3, inside):
     assert inside(s3, *tiny(out, hidden=64)).returncode == 0
     law = common.closed_loop
     monkeypatch.setattr(ablations, "ROOT", tmp_path)
+    monkeypatch.setattr(common, "FEEDBACK", 1.0)  # four steps are few: with less no limit is reached
     vars(s3).update(STARTS=4, NOISY=2, TRAVERSAL=3, SINGLE_RUN=(1, 4), MULTI_RUN=(2, 2))
     ablations.closed_loops(s3, out, [0])
     rows = {row["loop"]: row for row in common.read_csv(tmp_path / "results/closed_loop.csv")}
