@@ -156,7 +156,7 @@ def port(folder):
         own_page_works(port)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
-        assert process.returncode == 0 and not err and re.search(r"\n[1-9]\d* steps, ", out)
+        assert process.returncode == 0 and not err and re.search(r"^[1-9]\d* steps, ", out, re.M)
     finally:
         process.kill()
 
