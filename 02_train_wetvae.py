@@ -189,8 +189,8 @@ def check_factors(decoder, names, steps):
 def find_relation(decoder, names, steps, z_range):
     """Alg. 1, "Test: find relation functions", from the decoder alone (the paper: by hand, after the policy).
     For each factor of z_multi: the weight in [-1, 1] with which single steps, chained by common.next_skill,
-    come nearest to the free run, one decoder run of `steps` transitions with all of z. Both run for each
-    skill of a 13 x 13 grid of speed and factor. Error: RMS difference / RMS displacement. {factor: weight}"""
+    come nearest to the free run, one decoder run of `steps` transitions with all of z, over a 13 x 13 grid
+    of speed and factor. The error: RMS difference / RMS displacement. Returns {factor: weight}."""
     grid, relation = torch.linspace(-z_range, z_range, 13), {}
     for factor in [name for name in names if MULTI.get(name) in names]:
         z = torch.zeros(len(grid) ** 2, len(names))  # direction 0: a turn stays within the data's directions
