@@ -247,8 +247,8 @@ class Actor(nn.Module):
 # -------- execution of skills, Alg. 2, lines 13 to 16 and 19
 
 def closed_loop(c, reference, robots, scale):
-    """Commands (n, 2 or 1), trajectory units: c plus a share, FEEDBACK, of reference - place (metres each), at
-    most CORRECTION long."""
+    """Commands (n, 2 or 1), trajectory units: c plus a share, FEEDBACK, of reference - place (in metres),
+    at most CORRECTION long."""
     correction = FEEDBACK * (reference - robots.place()) / scale
     size = correction.norm(dim=1, keepdim=True)
     return c + correction * (CORRECTION / size.clamp(min=max(CORRECTION, 1e-9)))  # 0 switches it off
