@@ -269,7 +269,8 @@ gui.Checkbox = lambda name, value: (False, False)
 act = common.Actor.act
 def kept(self, s, c, deterministic=False):
     commands.append(c[0].tolist())
-    print("command", *c[0].tolist(), flush=True)
+    sys.stdout.write("\\ncommand " + " ".join(map(str, c[0].tolist())) + "\\n")  # whole: the viewer's thread prints too
+    sys.stdout.flush()
     return act(self, s, c, deterministic)
 common.Actor.act = kept
 """
