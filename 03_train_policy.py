@@ -263,8 +263,6 @@ def check(source):
              f"the {ROBOT} needs another --decoder")
     if DISCOUNT == 1:
         stop("--discount must be below 1: no step is terminal, so values would have no bound")
-    if METHOD == "sectar" and EPISODE % SKILL_STEPS:
-        stop(f"SeCTAR: --skill_steps must divide --episode, {EPISODE}")
     if METHOD == "dads" and SINGLE_RUN[0] * MULTI_RUN[0] > 1:
         stop("DADS predicts one step: T, the first of --single_run and --multi_run, must be 1")
     steps = max(REPLAY, 2 * ROBOTS * SKILL_STEPS)
@@ -290,10 +288,7 @@ def start_robots():
     times; the generator of their starts; and what submits their next step to the second core."""
     robots, rng = common.Robots(common.robot_spec(ROBOT), ROBOTS), np.random.default_rng(SEED)
     robots.reset(np.arange(ROBOTS), rng)
-    age = rng.integers(0, EPISODE, ROBOTS)
-    if METHOD == "sectar":
-        age -= age % SKILL_STEPS  # together: trajectories are rows of the replay buffer
-    robots.time[:] = age * robots.step_seconds
+    robots.time[:] = rng.integers(0, EPISODE, ROBOTS) * robots.step_seconds
     worker = ThreadPoolExecutor(1)
 
     def submit(action):
@@ -317,8 +312,7 @@ class Replay:
 
     def __init__(self, **widths):
         self.widths, self.added = widths, 0
-        block = ROBOTS * SKILL_STEPS  # at least two skills of all robots
-        self.table = torch.zeros(max(2, REPLAY // block) * block, sum(widths.values()))
+        self.table = torch.zeros(max(REPLAY, 2 * ROBOTS * SKILL_STEPS), sum(widths.values()))
 
     def add(self, unstable, **fields):
         """One step of all robots: fields (n, width) each. unstable (n,): whose step means nothing."""
@@ -337,14 +331,11 @@ class Replay:
         n = min(n, max(self.added, ROBOTS), len(self.table))
         return self.read((self.added - n + torch.arange(n)) % len(self.table))
 
-    def trajectories(self, n, recent):
-        """n random whole skills of the `recent` latest steps, for SeCTAR, whose robots begin them together:
-        fields (n, SKILL_STEPS, width)."""
-        block = ROBOTS * SKILL_STEPS
-        done, blocks = self.added // block, len(self.table) // block
-        back = torch.randint(max(1, min(done, blocks - 1, recent // block)), (n,))
-        first = (done - 1 - back) % blocks * block + torch.randint(ROBOTS, (n,))
-        return self.read(first[:, None] + ROBOTS * torch.arange(SKILL_STEPS))
+    def trajectories(self, n, steps, recent):
+        """n random stretches of `steps` steps of one robot, within the `recent` latest: (n, steps, width)."""
+        newest = max(ROBOTS * steps, min(self.added, recent, len(self.table)))  # at least one of each robot
+        last = self.added - 1 - torch.randint(newest - ROBOTS * (steps - 1), (n,))
+        return self.read((last[:, None] - ROBOTS * torch.arange(steps).flip(0)) % len(self.table))
 
     def sample(self, n, recent=None):
         """n random steps, of all or of the `recent` latest ones."""
@@ -461,29 +452,29 @@ def train_dads(_decoder, _names):
 
 
 def train_sectar(_decoder, _names):
-    """Co-Reyes et al. 2018, in short: skills z ~ N(0, I) of T = SKILL_STEPS steps; a VAE learns from the
-    policy's own trajectories (theirs: an explorer's, whose actions it clones), and the policy is rewarded for
-    ending where the decoder ends. Not reproduced: its skills are not followed."""
+    """Co-Reyes et al. 2018, in short: a VAE learns from the policy's own trajectories, T = SKILL_STEPS steps of
+    a robot (theirs: an explorer's, whose actions it clones), and the policy is rewarded for making the steps
+    that the decoder predicts for z ~ N(0, I). Not reproduced: its skills are not followed."""
     robots, rng, submit = start_robots()
     s_dim, a_dim = robots.observe().shape[1], robots.ctrl.shape[1]
-    sac, replay = Sac(s_dim, 2, a_dim), Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=2, z=Z_DIM)
+    sac, replay = Sac(s_dim, 2, a_dim), Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=2, c=2, z=Z_DIM)
     vae = nn.ModuleDict(dict(decoder=Decoder(Z_DIM, 2, 64), encoder=layers(2 * SKILL_STEPS, 64, 2 * Z_DIM)))
     adam = torch.optim.Adam(vae.parameters(), lr=LEARNING_RATE, fused=True)
     log = Log(make_policy(sac, vae["decoder"], [], STEP_SCALE), robots, rng, replay, sac, vae, adam)
     z = replay.latest(ROBOTS).z
 
     while sac.updates < UPDATES:
-        t = replay.added // ROBOTS % SKILL_STEPS  # of all robots: trajectories are rows of the replay buffer
-        z = torch.randn(ROBOTS, Z_DIM) if t == 0 else z
+        t = robots.age() % SKILL_STEPS
+        z = torch.where(t == 0, torch.randn(ROBOTS, Z_DIM), z)
         with torch.no_grad():
-            command = vae["decoder"](z, SKILL_STEPS)[0][:, t]
+            c = vae["decoder"](z, SKILL_STEPS)[0][torch.arange(ROBOTS), t[:, 0].long()]
         s = robots.observe()
-        a = sac.actor.act(s, command) if replay.added >= WARM_UP else torch.rand(ROBOTS, a_dim) * 2 - 1
+        a = sac.actor.act(s, c) if replay.added >= WARM_UP else torch.rand(ROBOTS, a_dim) * 2 - 1
         physics = submit(a)
         if replay.added >= max(WARM_UP, ROBOTS * SKILL_STEPS):
             if sac.updates == 0:
                 sac.normalise(replay.read(slice(0, replay.added)).s)
-            x = replay.trajectories(MODEL_BATCH, RECENT).displacement / STEP_SCALE
+            x = replay.trajectories(MODEL_BATCH, SKILL_STEPS, RECENT).displacement / STEP_SCALE
             mean, log_var = vae["encoder"](x.flatten(1)).chunk(2, 1)  # theirs: a bidirectional LSTM
             kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1)
             sampled = mean + (0.5 * log_var).exp() * torch.randn_like(mean)
@@ -494,19 +485,12 @@ def train_sectar(_decoder, _names):
             adam.zero_grad()
             model_loss.backward()
             adam.step()
-            batch = replay.trajectories(max(1, UPDATES_PER_STEP * BATCH // SKILL_STEPS), REPLAY)
-            with torch.no_grad():
-                c = vae["decoder"](batch.z[:, 0], SKILL_STEPS)[0]
-            # The end's Laplace likelihood, -|sum of errors|, in shares; the steps' own favours standing still
-            error = batch.displacement / STEP_SCALE - c
-            r = -REWARD_SCALE * (error * nn.functional.normalize(error.sum(1))[:, None]).sum(2)
-            c2 = torch.cat([c[:, 1:], c[:, -1:]], 1)
-            order = torch.randperm(r.numel())
-            flat = SimpleNamespace(**{name: part.flatten(0, 1)[order] for name, part in vars(batch).items()})
-            losses = sac.learn(flat, c.flatten(0, 1)[order], c2.flatten(0, 1)[order], r.flatten()[order])
+            batch = replay.sample(UPDATES_PER_STEP * BATCH)
+            r = -REWARD_SCALE * (batch.displacement / STEP_SCALE - batch.c).norm(dim=1)
+            losses = sac.learn(batch, batch.c, batch.c, r)
             log.numbers = losses | dict(reward=r.mean(), model_loss=model_loss.detach())
         displacement, unstable = physics.result()
-        replay.add(unstable, s=s, a=a, s2=robots.observe(), displacement=displacement, z=z)
+        replay.add(unstable, s=s, a=a, s2=robots.observe(), displacement=displacement, c=c, z=z)
         robots.reset(np.flatnonzero((robots.age()[:, 0].numpy() >= EPISODE) | unstable), rng)
         log.step()
     return log.policy

@@ -62,7 +62,7 @@ GOAL: tuple[Signed, Signed] = (24.0, 12.0)  # metres; the Ant starts at (0, 0)
 STUDY = dict(METHOD="wedis wedis_s wedis_nts dads dads_speed sectar", POLICY_SEEDS=(0, 1, 2), TRIALS=20)
 EXPERIMENTS = {  # a row names the constants in which an experiment differs; its name is that of its CSV
     "mazes": {},
-    "figure7": STUDY | dict(SAMPLES=(10, 100, 1000, 10_000), DRAW="fig07"),  # stopped, it goes on
+    "figure7": STUDY | dict(SAMPLES=(10, 100, 300, 1000, 3000, 10_000), DRAW="fig07"),  # stopped, it goes on
     "matched": STUDY | dict(SAMPLES=1000, LOOK_AHEAD=(200, 600), DRAW=""),  # all but DADS look so far
     "fig18": dict(MAZES="s_maze obstacles", REWARDS="dense", MODES="printed closed", POLICY_SEEDS=(0, 1, 2),
                   DRAW="fig18"),
@@ -86,11 +86,11 @@ METHODS = {  # Table 2
     "wedis": {},
     "wedis_s": dict(MODES="printed commands", LENGTH=1, PLANNED=4),  # single steps
     "wedis_nts": dict(MODES="printed commands", HOLD=1, LENGTH=20, PLANNED=4,  # no trajectory scaling
-                      SAMPLES=(10, 100, 1000)),  # its sparse plans have 600 transitions: 0.4 s at 10,000
+                      SAMPLES=(10, 100, 300, 1000)),  # its sparse plans have 600 transitions: 0.4 s at 10,000
     "dads": DADS,
     "dads_speed": DADS | dict(EPISODE=255, HOLD=17),  # a skill as long as one of WEDIS's transitions, 2.7 m
     "sectar": dict(MODES="printed", POLICY="ant_sectar", POLICY_SEEDS=(0,), HOLD=1, LENGTH=40, PLANNED=4,
-                   SAMPLES=(10, 100, 1000)),
+                   SAMPLES=(10, 100, 300, 1000)),
 }
 
 # -------- Algorithm 2, Sec. 5; its lines are counted from "for i", each "end" is one

@@ -46,7 +46,7 @@ SINGLE = ("speed", "direction")  # factors of z_single, Sec. 4.2.2
 MULTI = dict(curvature="direction", acceleration="speed")  # factors of z_multi, and what they change in time
 CLASSES = dict(speed=4, direction=4, curvature=3, acceleration=3, x=4, y=4)  # of labels, App. A.1.1, A.3.1
 FRAME_SKIP: Count = 5     # physics steps of 0.01 s per environment step
-FEEDBACK: Share = 0.1     # closed loop: share of (reference - place) added to a command (the paper: 0)
+FEEDBACK: Share = 0.2     # closed loop: share of (reference - place) added to a command (the paper: 0)
 CORRECTION: float = 0.2   # closed loop: the most that is added, trajectory units
 FORMAT = 5                # of the artifacts; raise it when their meaning changes
 HERE = Path(__file__).resolve().parent

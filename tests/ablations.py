@@ -81,7 +81,7 @@ def main(folder):
 # ---------------------------------------------------------------- parts of the closed loop, without training
 
 LOOPS = {  # what differs in common.py
-    "as shipped": {}, "no limit": dict(CORRECTION=1e6), "half the limit": dict(CORRECTION=0.1),
+    "as shipped": {}, "no limit": dict(CORRECTION=1e6), "half the limit": dict(CORRECTION=0.1), "half the feedback": dict(FEEDBACK=0.1),
     "no feedback": dict(FEEDBACK=0.0)}
 
 

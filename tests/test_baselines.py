@@ -96,13 +96,12 @@ def test_relabelled_steps_of_dads_have_fresh_skills(s3, dads):
 
 @pytest.fixture
 def sectar(s3, monkeypatch):
-    """sectar(prepare, steps) -> one pass of train_sectar over a full replay buffer: 4 trajectories of 6 robots, 5 steps
-    each, of which 3 steps of a fifth have overwritten a part. A state holds when it was made and by whom."""
+    """sectar(prepare, steps) -> one pass of train_sectar over a full replay buffer: 20 steps of 6 robots. A state holds when
+    it was made and by whom."""
     torch.manual_seed(0)
     vars(s3).update(METHOD="sectar", ROBOTS=6, SKILL_STEPS=5, EPISODE=10, REPLAY=120, WARM_UP=10, HIDDEN=8, THREADS=1,
                     UPDATES=10 ** 9, UPDATES_PER_STEP=4, BATCH=200, MODEL_BATCH=40, Z_DIM=4, RECENT=60, REWARD_SCALE=0.3,
                     LEARNING_RATE=0.0)
-    skills = torch.randn(5, 6, 4)
 
     def run(prepare=lambda log: None, steps=4 * 5 + 3, passes=1):
         def fill(replay):
@@ -111,9 +110,7 @@ def sectar(s3, monkeypatch):
                 for robot in range(6):
                     row = replay.read(slice((6 * step + robot) % 120, (6 * step + robot) % 120 + 1))  # a view
                     row.s[0, :2] = torch.tensor([step, robot])
-                    row.s2[0, :2] = torch.tensor([step + 1, robot])
-                    row.displacement[0] = 0.05 * torch.randn(2)
-                    row.z[0] = skills[step // 5, robot]
+                    row.displacement[0], row.c[0] = 0.05 * torch.randn(2), torch.randn(2)
         done = one_pass(s3, monkeypatch, lambda: s3.train_sectar(None, []), fill, prepare, passes)
         vae = done.log.parts[0]
         done.encoder, done.decoder = vae["encoder"].requires_grad_(False), vae["decoder"].requires_grad_(False)
@@ -121,42 +118,35 @@ def sectar(s3, monkeypatch):
     return run
 
 
-def test_one_pass_of_sectar_pays_the_place_where_a_trajectory_ends(s3, sectar):
+def test_one_pass_of_sectar_pays_the_steps_that_were_asked(sectar):
     done = sectar()
-    stored = {tuple(s[:2].int().tolist()): (d, z) for s, d, z in zip(done.stored.s, done.stored.displacement, done.stored.z)}
-    assert len(stored) == 120
-    whole = set()
-    for s, c, c2, found in zip(done.batch.s, done.c, done.c2, done.r):
-        step, robot = s[:2].int().tolist()
-        t, (_, z) = step % 5, stored[step, robot]
-        first = step - t
-        assert 0 < first < 20  # a trajectory that is whole
-        whole.add((step, robot))
-        path = torch.stack([stored[first + i, robot][0] for i in range(5)]) / 0.1
-        decoded = done.decoder(z[None], 5)[0][0]
-        miss = path - decoded
-        end = miss.sum(0) / miss.sum(0).norm()
-        assert found.item() == pytest.approx(-0.3 * float(miss[t] @ end), abs=1e-5)
-        torch.testing.assert_close(c, decoded[t])  # the command of now, and of the next step
-        torch.testing.assert_close(c2, decoded[min(4, t + 1)])
-    assert len(done.r) == 800 and len(whole) > 80  # of 90 whole ones
+    assert len(done.r) == 800 and len(done.c.unique(dim=0)) > 110  # of 120 steps
+    expected = [-0.3 * math.hypot(*(10 * d - c).tolist()) for d, c in zip(done.batch.displacement, done.batch.c)]
+    torch.testing.assert_close(done.r, torch.tensor(expected))
+    assert torch.equal(done.c, done.batch.c) and torch.equal(done.c2, done.c)
 
 
-def test_sectar_waits_for_the_first_whole_trajectories(sectar):
+def test_sectar_waits_for_the_first_trajectories(sectar):
     assert sectar(steps=4).batch is None and sectar(steps=5).batch is not None
 
 
-def test_robots_of_sectar_begin_their_skills_together_and_are_asked_for_decoded_steps(s3, sectar, monkeypatch):
-    """Skills of 600 robots, from the prior, new at each fifth step; their commands, one displacement after another."""
+def test_robots_of_sectar_are_asked_for_the_steps_that_are_decoded_from_their_skills(s3, sectar, monkeypatch):
+    """Skills of 600 robots, from the prior, each new at its own fifth step; their commands, one displacement after another."""
     vars(s3).update(ROBOTS=600, REPLAY=9000, WARM_UP=1)  # the first step is random
-    asked, act = [], common.Actor.act
+    asked, ages, act = [], [], common.Actor.act
     monkeypatch.setattr(common.Actor, "act", lambda actor, s, c: asked.append(c) or act(actor, s, c))
+    age = common.Robots.age
+    monkeypatch.setattr(common.Robots, "age", lambda robots: ages.append(age(robots)) or ages[-1])
     done = sectar(steps=0, passes=12)
-    z = done.log.replay.read(torch.arange(12 * 600).view(12, 600)).z
-    assert (z[1:] != z[:-1]).any(2).float().mean(1).tolist() == [float(t % 5 == 0) for t in range(1, 12)]
-    assert z[[0, 5, 10]].flatten(0, 1).std(0).tolist() == pytest.approx([1] * 4, abs=0.08)
-    for t, c in enumerate(asked, 1):
-        torch.testing.assert_close(c, done.decoder(z[t], 5)[0][:, t % 5])
+    stored = done.log.replay.read(torch.arange(12 * 600).view(12, 600))
+    t = torch.stack(ages[::2])[:, :, 0] % 5  # each pass asks twice: when it draws, and when it resets
+    for z, before, new in zip(stored.z[1:], stored.z[:-1], t[1:] == 0):
+        assert torch.equal((z != before).any(1), new)
+        assert 0.1 < new.float().mean() < 0.3
+    assert stored.z[t == 0].std(0).tolist() == pytest.approx([1] * 4, abs=0.08)
+    for z, c, at, kept in zip(stored.z[1:], asked, t[1:].long(), stored.c[1:]):
+        torch.testing.assert_close(c, done.decoder(z, 5)[0][torch.arange(600), at])
+        assert torch.equal(c, kept)
 
 
 def test_elbo_of_sectar_equals_torch_distributions(s3, sectar):
@@ -166,9 +156,9 @@ def test_elbo_of_sectar_equals_torch_distributions(s3, sectar):
         log.parts[0]["decoder"].head[2].bias.data[3] = -8  # below the least deviation
     done = sectar(prepare)
     torch.set_rng_state(done.random)
-    back, robot = torch.randint(2, (40,)), torch.randint(6, (40,))  # RECENT: 60 steps are the two latest trajectories
-    rows = (3 - back) % 4 * 30 + robot
-    x = torch.stack([done.stored.displacement[rows + 6 * i] for i in range(5)], 1) / 0.1
+    last = 6 * 23 - 1 - torch.randint(36, (40,))  # RECENT: the whole trajectory is within the latest 60 steps
+    steps = {tuple(s[:2].int().tolist()): d for s, d in zip(done.stored.s, done.stored.displacement)}
+    x = torch.stack([torch.stack([steps[int(row) // 6 - 4 + i, int(row) % 6] for i in range(5)]) for row in last]) / 0.1
     mean, log_var = done.encoder(x.reshape(40, 10)).chunk(2, 1)
     q = D.Independent(D.Normal(mean, (0.5 * log_var).exp()), 1)
     z = mean + (0.5 * log_var).exp() * torch.randn(40, 4)
