@@ -45,7 +45,7 @@ PRINTED = dict(OWN_AXIS=False, BETA_WARM_UP=0)  # Eq. 4 as printed; mixes axes w
 POLAR = dict(DATA="polar", LABELS="speed direction")
 LINE = dict(DATA="speed_acc", LABELS="speed acceleration", EPOCHS=24, BETA=4, Z_RANGE=1)
 FOUR = dict(DATA="four_factors", LABELS="speed direction curvature acceleration", EPOCHS=60, BETA=4)
-WEIGHTS = ((9, 0), (9, 1), (1, 10), (3, 10), (9, 10))  # beta and gamma of our Fig 10
+WEIGHTS = [(9, 0), (9, 1), (1, 10), (3, 10), (9, 10)]  # beta and gamma of our Fig 10
 MODELS = {  # a row names the constants, from DATA to Z_RANGE, in which a model differs
     "main": {}, "main_none": NONE, "full": dict(DATA="full"), "four_factors": FOUR,
     "polar": POLAR, "polar_cartesian": POLAR | dict(LABELS="x y"),
@@ -66,8 +66,7 @@ FIGURES = {  # a column of a figure: title ("": the model's name), model, T of i
 
 
 class Encoder(nn.Module):
-    """q_phi(z | tau, y), Fig 1: an LSTM reads a displacement and all labels at each step, and its last state
-    gives a Gaussian over z."""
+    """q_phi(z | tau, y), Fig 1: an LSTM reads displacements and labels; its last state gives a Gaussian."""
     def __init__(self, x_dim, y_dim, z_dim, hidden):
         super().__init__()
         self.cell = nn.LSTMCell(x_dim + y_dim, hidden)  # in short loops faster than nn.LSTM
@@ -212,9 +211,7 @@ def main():
     config, given = common.parse_flags(globals())
     torch.set_num_threads(THREADS)
     columns = FIGURES.get(EXPERIMENT) or [("", EXPERIMENT, 0)]
-    models = {column[-2]: hyperparameters(column[-2], config, given) for column in columns}
-    datasets = {data: load(OUT, "dataset", data, SEED) for data in {m.data for m in models.values()} if TRAIN}
-    check(columns, models, datasets)
+    models, datasets = check(columns, config, given)
     trained = {}
     for name, hyper in models.items():
         constants = {field.upper(): value for field, value in vars(hyper).items()}
@@ -250,18 +247,21 @@ def hyperparameters(name, config, given):
                               for key in list(kinds)[list(kinds).index("DATA"):]})
 
 
-def check(columns, models, datasets):
-    """End with one line, before training, if a row names what is not there or a model misfits its data."""
+def check(columns, config, given):
+    """The hyperparameters of the models, and their data sets. Ends with one line if any makes no sense."""
     if EXPERIMENT not in (*FIGURES, *MODELS):
         stop(f"unknown experiment {EXPERIMENT!r}; allowed: {' '.join([*FIGURES, *MODELS])}")
     for column in columns:
-        if len(column) != 3 or column[1] not in MODELS:
-            stop(f"{column} in FIGURES must be (title, model, T) with a model of MODELS: {' '.join(MODELS)}")
-        if unknown := [key for key in MODELS[column[1]] if key.lower() not in vars(models[column[1]])]:
-            stop(f"{unknown[0]} of model {column[1]} is no constant in which models can differ")
+        if [*map(type, column)] != [str, str, int] or column[1] not in MODELS or column[2] < 0:
+            stop(f"{column!r} in FIGURES must be (title, model, T), the model one of: {' '.join(MODELS)}")
+    models = {name: hyperparameters(name, config, given) for _, name, _ in columns}
+    for name, hyper in models.items():
+        if unknown := [key for key in MODELS[name] if key.lower() not in vars(hyper)]:
+            stop(f"{unknown[0]} of model {name} is no constant in which models can differ")
+    datasets = {data: load(OUT, "dataset", data, SEED) for data in {m.data for m in models.values()} if TRAIN}
     for name, hyper in models.items() if datasets else ():
         data, at = datasets[hyper.data], f"model {name}, data set {hyper.data}: "
-        make = f"python 01_make_dataset.py --seed {SEED} --experiment {hyper.data}"
+        make = f"python 01_make_dataset.py --seed {SEED} --experiment {hyper.data} --out {OUT}"
         known = data["names"].tolist() + ["x", "y"] * (data["trajectories"].shape[2] == 2)
         if not hyper.labels or set(hyper.labels.split()) - set(known):
             stop(f"{at}--labels {hyper.labels!r} must be factors of these data, which are: {' '.join(known)}")
@@ -275,6 +275,7 @@ def check(columns, models, datasets):
             if len(counts) > common.CLASSES[factor] or counts.min() < 0.005 * len(y):
                 stop(f"{at}{counts.min()} of {len(y)} trajectories are of class {counts.argmin() + 1} of "
                      f"{factor}: leave it out of --labels, or {mend}")
+    return models, datasets
 
 
 @torch.no_grad()
@@ -304,8 +305,7 @@ def measure(name, model):
     decoder, names, values = model["decoder"], model["names"], np.linspace(-1.5, 1.5, 61)
     curves = [factors_of(traverse(decoder, i, values, model["length"]), names) for i in range(len(names))]
     (C, purity), rows = common.cross_talk(curves, model["ranges"]), []
-    groups = [group for group in MODELS if name.startswith(group + "_")]
-    group = max(groups, key=len, default=name)
+    group = max((group for group in MODELS if name.startswith(group + "_")), key=len, default=name)
     same = dict(experiment=group, seed=SEED, labels=name.removeprefix(group + "_"))
     for i, factor in enumerate(names):
         curve = np.degrees(curves[i][factor]) if factor in ("direction", "curvature") else curves[i][factor]

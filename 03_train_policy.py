@@ -265,8 +265,9 @@ def check(source):
         stop("--discount must be below 1: no step is terminal, so values would have no bound")
     if METHOD == "dads" and SINGLE_RUN[0] * MULTI_RUN[0] > 1:
         stop("DADS predicts one step: T, the first of --single_run and --multi_run, must be 1")
-    steps = max(REPLAY, 2 * ROBOTS * SKILL_STEPS)
-    common.need_memory(300 * steps + 50_000 * ROBOTS, "--replay or --robots")  # bytes of a step, of a robot
+    common.need_memory(300 * max(REPLAY, 2 * ROBOTS * SKILL_STEPS) + 50_000 * ROBOTS, "--replay or --robots")
+    common.need_memory(400 * HIDDEN ** 2 + 1000 * UPDATES_PER_STEP * BATCH, "--hidden or --batch")
+    common.need_memory(100_000 * (STARTS + NOISY * TRAVERSAL), "--starts, --noisy or --traversal")
 
 
 def made_with():
@@ -392,7 +393,8 @@ class Log:
         for part, state in zip(self.parts, saved["parts"]):
             part.load_state_dict(state)
         self.replay.table[:len(saved["table"])] = saved["table"]
-        self.replay.added, self.sac.updates = saved["added"], saved["updates"]
+        self.replay.added = self.policy.env_steps = saved["added"]
+        self.sac.updates = self.policy.updates = saved["updates"]
         self.robots.batch.state[:] = saved["robots"].numpy()
         for name in ("curve", "seconds", "scale"):
             setattr(self.policy, name, saved[name])
@@ -452,9 +454,9 @@ def train_dads(_decoder, _names):
 
 
 def train_sectar(_decoder, _names):
-    """Co-Reyes et al. 2018, in short: a VAE learns from the policy's own trajectories, T = SKILL_STEPS steps of
-    a robot (theirs: an explorer's, whose actions it clones), and the policy is rewarded for making the steps
-    that the decoder predicts for z ~ N(0, I). Not reproduced: its skills are not followed."""
+    """Co-Reyes et al. 2018, in short: a VAE learns from the policy's own trajectories, T = SKILL_STEPS steps
+    of a robot (theirs: an explorer's, whose actions it clones), and the policy is rewarded for making the
+    steps that the decoder predicts for z ~ N(0, I). Not reproduced: its skills are not followed."""
     robots, rng, submit = start_robots()
     s_dim, a_dim = robots.observe().shape[1], robots.ctrl.shape[1]
     sac, replay = Sac(s_dim, 2, a_dim), Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=2, c=2, z=Z_DIM)

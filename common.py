@@ -15,6 +15,7 @@ import json
 import math
 import os
 import re
+import shlex
 import signal
 import sys
 import tokenize
@@ -36,9 +37,10 @@ from torch.utils._pytree import tree_leaves
 # Types of constants: least, most, in words
 Whole = Annotated[int, 0, 2 ** 63 - 1, "a whole number of at least 0, below 2 ** 63"]  # what int means here
 Count = Annotated[int, 1, 2 ** 63 - 1, "a whole number of at least 1"]
-Number = Annotated[float, 0, 1e300, "a number of at least 0"]  # what float means here
-Positive = Annotated[float, 1e-300, 1e300, "a number above 0"]
-Signed = Annotated[float, -1e300, 1e300, "a number"]
+Number = Annotated[float, 0, 1e30, "a number of at least 0, at most 1e30"]  # what float means here
+Positive = Annotated[float, 1e-30, 1e30, "a number above 0, at most 1e30"]
+Signed = Annotated[float, -1e30, 1e30, "a number"]
+AsWritten = Annotated[lambda n: int(n) if n == int(n) else float(n), -1e30, 1e30, "a number"]
 Share = Annotated[float, 0, 1, "a number from 0 to 1"]
 Degrees = Annotated[float, 0, 180, "a number from 0 to 180"]
 
@@ -346,8 +348,11 @@ def convert(value, kind, name):
 
 
 def types_of(module):
-    """{NAME: type} of the constants with a declared type. Python 3.14 keeps them as a function."""
-    return module.get("__annotations__") or module["__annotate__"](1)
+    """{NAME: type} of the constants of a file, in its order; guessed if a reader has left it out."""
+    declared = module.get("__annotations__") or module["__annotate__"](1)  # Python 3.14 makes them by a call
+    guess = {bool: bool, str: str, int: AsWritten, float: AsWritten, tuple: tuple[AsWritten, ...]}
+    return {name: declared.get(name) or guess[type(value)] for name, value in module.items()
+            if name in declared or name.isupper() and name not in globals() and type(value) in guess}
 
 
 def parse_flags(stage, argv=None):
@@ -359,10 +364,7 @@ def parse_flags(stage, argv=None):
         signal.signal(number, lambda *_: stop("stopped" + again, 1))
     if hasattr(signal, "SIGPIPE"):
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # piped into head
-    declared = types_of(stage)
-    kinds = {name: declared.get(name, type(value)) for name, value in stage.items()
-             if name.isupper() and name not in globals()
-             and (name in declared or isinstance(value, (bool, int, float, str)))}
+    kinds = types_of(stage)
     parser = argparse.ArgumentParser(description=stage["__doc__"], allow_abbrev=False,
                                      argument_default=argparse.SUPPRESS,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -382,7 +384,7 @@ def parse_flags(stage, argv=None):
             stop(f"unknown experiment {experiment!r}; allowed: {' '.join(rows)}")
         row = rows[experiment]
         if unknown := set(row) - set(kinds):
-            stop(f"{' '.join(unknown)} in the row {experiment!r} of EXPERIMENTS is no constant of this file")
+            stop(f"{unknown.pop()} in the row {experiment!r} of EXPERIMENTS is no constant of this file")
     values = {name: stage[name] for name in kinds} | row | given
     config = {name: convert(values[name], kind, "--" + name.lower()) for name, kind in kinds.items()}
     stage.update(config)
@@ -402,10 +404,10 @@ def need_memory(size, mend):
 
 def made_by(config):
     """All that makes a result: a stage's constants, common.py's, and the robots' files."""
-    own = {name: globals()[name] for name in types_of(globals())}
-    files = {path.name: hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-             for path in sorted((HERE / "robots").glob("*.xml"))}
-    return config | dict(CLASSES=CLASSES) | own | files
+    own = dict(FRAME_SKIP=FRAME_SKIP, FEEDBACK=FEEDBACK, CORRECTION=CORRECTION, CLASSES=CLASSES)
+    files = {name: hashlib.sha256((HERE / "robots" / name).read_bytes()).hexdigest()[:16]
+             for name in ("ant.xml", "half_cheetah.xml")}
+    return config | own | files
 
 
 def digest(values):
@@ -455,8 +457,9 @@ def save(out, kind, experiment, seed, config, **content):
 def load(out, kind, experiment, seed, **same):
     """Read an artifact from <out>/, else pretrained/, and say which. Returns its content and "sha256". Exits
     with 2 if it is missing, damaged, foreign, not finite, or made with other constants than those of same."""
-    name, kind_of_stage = artifact_name(kind, experiment, seed), kind.partition("-")[0]
-    make = f"make it with: python {SCRIPT[kind_of_stage]} --seed {seed} --experiment {experiment}"
+    name, stage = artifact_name(kind, experiment, seed), SCRIPT[kind.partition("-")[0]]
+    make = "make it with: " + shlex.join(["python", stage, "--seed", str(seed), "--experiment", experiment,
+                                          "--out", str(out)])
     paths = [path for path in (Path(out) / name, HERE / "pretrained" / name) if path.exists()]
     if not paths:
         stop(f"no {name} in {out}/ or pretrained/; {make}")
@@ -471,7 +474,7 @@ def load(out, kind, experiment, seed, **same):
     made = content["config"] | content
     for key, value in (dict(format=FORMAT, kind=kind, experiment=experiment, seed=seed) | same).items():
         if made.get(key) != value:
-            mend = f"set {key} back, or {make}" if key.isupper() else make
+            mend = f"set {key} back, or {make}, and the flags of this run" if key.isupper() else make
             stop(f"{path} was made with {key} = {made.get(key)}, not {value}: {mend}")
     numbers = [np.asarray(leaf) for leaf in tree_leaves(content) if not isinstance(leaf, str)]
     if not all(np.isfinite(leaf).all() for leaf in numbers if leaf.dtype.kind == "f"):

@@ -220,7 +220,7 @@ def test_constants_of_common_are_checked_too(tmp_path):
     shutil.copy(ROOT / f"{S1}.py", tmp_path)
     shutil.copytree(ROOT / "robots", tmp_path / "robots")
     for old, new, message in (("FRAME_SKIP: Count = 5 ", "FRAME_SKIP: Count = 2.5 ", "FRAME_SKIP in common.py is 2.5, but must be a whole"),
-                              ("FEEDBACK: Share = 0.1 ", "FEEDBACK: Share = -1 ", "FEEDBACK in common.py is -1, but must be a number from")):
+                              ("FEEDBACK: Share = 0.2 ", "FEEDBACK: Share = -1 ", "FEEDBACK in common.py is -1, but must be a number from")):
         assert text.count(old) == 1
         (tmp_path / "common.py").write_text(text.replace(old, new))
         done = cli(tmp_path / S1, "--out", tmp_path / "out")

@@ -468,7 +468,7 @@ def test_a_model_that_makes_no_sense_is_one_line(s2, inside, out, changed, words
     assert one_line(done) and words in done.stderr and not list(out.glob("*.pt")), done.stderr
 
 
-@pytest.mark.parametrize("columns", [[("t", "b", 5)], [("a", "main")]])
+@pytest.mark.parametrize("columns", [[("t", "b", 5)], [("a", "main")], ("", "main", 5), [("", "main", 5.0)], [("", "main", -1)]])
 def test_columns_without_a_model_are_one_line_before_training(s2, inside, out, columns):
     s2.FIGURES["fig04_latent_traversals"] = columns
     done = inside(s2, "--out", out)

@@ -119,7 +119,7 @@ def test_killed_three_times_it_ends_with_the_same_bits(fork, out):
     ("--experiment half_cheetah --base_frame true", "--base_frame false"),
     ("--experiment ant_dads --robot half_cheetah", "--robot ant"), ("--experiment ant_dads --z_dim 3", "--z_dim 2"),
     ("--decoder nope", "python 02_train_wetvae.py --seed 0 --experiment nope"),
-    ("--experiment ant_full --seed 7", "python 02_train_wetvae.py --seed 7 --experiment full\n"),
+    ("--experiment ant_full --seed 7", "python 02_train_wetvae.py --seed 7 --experiment full --out "),
     ("--robots 2.5", "a whole number"), ("--decoder_seed 7", "unrecognized arguments: --decoder_seed"),
     ("--experiment ant_dads --multi_run 2,5", "must be 1"), ("--robots 1e7", "lower --replay or --robots"),
     ("--replay 1e12", "lower --replay or --robots"),
@@ -128,7 +128,7 @@ def test_killed_three_times_it_ends_with_the_same_bits(fork, out):
     ("--seed 98", "python 02_train_wetvae.py --seed 98 --experiment main"),
     ("--smoothing -0.1", "a number from 0 to 1"), ("--discount 1", "below 1"), ("--relabelled 2", "a number from 0 to 1"),
     ("--step_scale 0", "a number above 0"), ("--single_run 1,2.5", "--single_run is '2.5', but must be a whole number"),
-    ("--experiment ant_sectar --skill_steps 7", "--skill_steps must divide --episode"),
+    ("--hidden 1e6", "lower --hidden or --batch"), ("--starts 1e10", "lower --starts"),
     ("--updates 0", "--updates"), ("--multi_run 5", "2 numbers")])
 def test_03_ends_in_one_line_before_training(flags, message, s3, inside, out, monkeypatch):
     monkeypatch.setattr(s3, "start_robots", lambda: pytest.fail("it trains"))
@@ -239,6 +239,23 @@ def test_a_small_stage_runs_and_each_constant_may_be_written_in_another_notation
         monkeypatch.setattr(module, name, value)  # parse_flags has set them
     done = small(stage)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stage_runs_whose_constants_have_lost_their_types(stage, small, tmp_path, monkeypatch, capsys):
+    """`BETA = 4` for `BETA: float = 9.0`, everywhere but in pairs that are then set to text; and a fraction by flag over it."""
+    text = (ROOT / f"{stage}.py").read_text()
+    bare = re.sub(r"^(?!EXPERIMENT|SAMPLES|SINGLE_RUN|MULTI_RUN)([A-Z_]+): [^=\n]+ = ", r"\1 = ", text, flags=re.M)
+    (tmp_path / f"{stage}.py").write_text(bare)
+    module = script(tmp_path / stage)
+    assert len(module.__annotations__) < 5 and list(common.types_of(vars(module))) == list(KINDS[stage])
+    monkeypatch.setitem(STAGES, stage, module)
+    done = small(stage)
+    assert done.returncode == 0, done.stderr
+    for name, kind in KINDS[stage].items():
+        if kind in (float, common.Share, common.Positive, common.Degrees, common.Signed):
+            setattr(module, name, 1)
+            assert common.parse_flags(vars(module), [f"--{name.lower()}", "0.375", "--out", str(tmp_path)])[0][name] == 0.375
 
 
 @EACH
