@@ -18,14 +18,14 @@ from torch import nn
 from torch.nn import functional as F
 
 import common
-from common import (MULTI, Count, Decoder, Positive, Share, commands_of, factors_of, load, plt, stop,
+from common import (MULTI, Count, Decoder, Positive, Share, Threads, commands_of, factors_of, load, plt, stop,
                     weak_labels)
 
 EXPERIMENT: str = "fig04_latent_traversals"  # a figure of FIGURES, with all its models, or a model of MODELS
 SEED: int = 0                # random seed, of the data set too
 OUT: str = "runs"            # folder of all that is written
 TRAIN: bool = True           # false: only measure and draw what is trained already
-THREADS: Count = 1           # CPU threads: two are no faster, and three times slower on a busy machine
+THREADS: Threads = 1         # CPU threads: two are no faster, and three times slower on a busy machine
 
 DATA: str = "main"           # experiment of 01 to train on
 LABELS: str = "speed direction curvature"  # the M factors of interest: a latent and a weak label y^m for each

@@ -14,8 +14,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import common  # before mujoco: it chooses how mujoco renders
-from common import (MULTI, SINGLE, Actor, Count, Decoder, Positive, Share, commands_of, execute, factors_of,
-                    layers, plt, stop)
+from common import (MULTI, SINGLE, Actor, Count, Decoder, Positive, Share, Threads, commands_of, execute,
+                    factors_of, layers, plt, stop)
 import numpy as np
 import torch
 from torch import nn
@@ -25,7 +25,7 @@ SEED: int = 0                 # random seed of the whole chain: data, decoder, p
 OUT: str = "runs"             # folder that everything is written to
 TRAIN: bool = True            # false: only measure and draw what is already trained
 RESUME: bool = False          # true: continue from the last checkpoint
-THREADS: Count = 2            # CPU threads; 1: updates wait for the robots' step, with the same result
+THREADS: Threads = 2          # CPU threads; 1: updates wait for the robots' step, with the same result
 
 DECODER: str = "main"         # model of 02 whose decoder is the reward
 ROBOT: str = "ant"            # ant or half_cheetah

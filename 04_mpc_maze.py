@@ -15,7 +15,7 @@ from timeit import timeit
 from types import SimpleNamespace
 
 import common  # before mujoco: it chooses how mujoco renders
-from common import BLUE, GREY, RED, Count, Signed, commands_of, convert, execute, plt, stop
+from common import BLUE, GREY, RED, Count, Signed, Threads, commands_of, convert, execute, plt, stop
 import mujoco
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from extras import render
 EXPERIMENT: str = "mazes"  # row of EXPERIMENTS below
 SEED: int = 0             # random seed of the trials
 OUT: str = "runs"         # folder that everything is written to
-THREADS: Count = 2        # CPU threads of the physics
+THREADS: Threads = 2      # CPU threads of the physics
 DRAW: str = "fig03 fig06 fig08 fig14 fig17 gif"  # rows of DRAWINGS below
 DRIVE: bool = False       # true: only serve a page with a slider for each axis of z
 SECONDS: float = 0.0      # until the page ends by itself; 0: when it is closed

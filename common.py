@@ -37,6 +37,7 @@ from torch.utils._pytree import tree_leaves
 # Types of constants: least, most, in words
 Whole = Annotated[int, 0, 2 ** 63 - 1, "a whole number of at least 0, below 2 ** 63"]  # what int means here
 Count = Annotated[int, 1, 2 ** 63 - 1, "a whole number of at least 1"]
+Threads = Annotated[int, 1, 1024, "a whole number of at least 1, at most 1024"]
 Number = Annotated[float, 0, 1e30, "a number of at least 0, at most 1e30"]  # what float means here
 Positive = Annotated[float, 1e-30, 1e30, "a number above 0, at most 1e30"]
 Signed = Annotated[float, -1e30, 1e30, "a number"]
@@ -492,11 +493,13 @@ def update_csv(path, rows, key):
     """Write rows (dicts), in place of those in the file that agree with one of them on the columns in key."""
     new = [{k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in row.items()} for row in rows]
     replaced = {tuple(row[k] for k in key) for row in new}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(f"{path}.lock", "w") as lock:  # seeds trained side by side share a file
+    with contextlib.ExitStack() as at_the_end:  # seeds trained side by side share a file: lock its folder
         try:
             import fcntl
-            fcntl.flock(lock, fcntl.LOCK_EX)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            folder = os.open(path.parent, os.O_RDONLY)
+            at_the_end.callback(os.close, folder)
+            fcntl.flock(folder, fcntl.LOCK_EX)
         except (ImportError, OSError) as error:  # Windows; some network drives
             print(f"{path} is not locked ({error}): let no other run write it now")
         old = read_csv(path) if path.exists() else []

@@ -193,4 +193,3 @@ if __name__ == "__main__":
         print(f"{what:24s} {ours:8.3f}   {name:36s} {peer:8.3f}   ratio {ours / peer:5.2f}   {unit}")
     common.update_csv(ROOT / "results/bench.csv", [dict(what=what, ours=ours, peer=peer, peer_name=name, ratio=ours / peer,
                                                         unit=unit) for what, ours, peer, name, unit in rows], ("what", "peer_name"))
-    (ROOT / "results/bench.csv.lock").unlink(missing_ok=True)

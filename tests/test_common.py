@@ -404,6 +404,14 @@ def test_a_table_that_cannot_be_locked_is_said_in_one_line_and_written(tmp_path,
     assert common.read_csv(tmp_path / "t.csv") == [dict(a="x", n="1")]
 
 
+def test_a_table_that_cannot_be_written_is_one_line(tmp_path, capsys):
+    (tmp_path / "results").write_text("a file is in the way")
+    with pytest.raises(SystemExit) as end:
+        common.update_csv(tmp_path / "results" / "t.csv", [dict(a="x", n=1)], ("a",))
+    error = capsys.readouterr().err
+    assert end.value.code == 1 and len(error.splitlines()) == 1 and "cannot write" in error and "--out" in error
+
+
 def write_often(folder, name):
     for i in range(40):
         common.update_csv(folder / "t.csv", [dict(a=name, n=i)], ("a", "n"))
@@ -422,7 +430,8 @@ def test_two_processes_write_the_same_files_at_once(tmp_path):
         writer.join()
     assert [writer.exitcode for writer in writers] == [0, 0]
     rows = {(row["a"], int(row["n"])) for row in common.read_csv(tmp_path / "t.csv")}
-    assert rows == {(name, i) for name in "ab" for i in range(40)} and not list(tmp_path.glob("*.partial"))
+    assert rows == {(name, i) for name in "ab" for i in range(40)}
+    assert {path.name for path in tmp_path.iterdir()} == {"t.csv", "dataset_x_seed0.npz"}  # no part, no lock is left
 
 
 @pytest.mark.parametrize("end", [SystemExit(1), OSError(28, "No space left on device")])

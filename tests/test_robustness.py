@@ -128,7 +128,8 @@ def test_killed_three_times_it_ends_with_the_same_bits(fork, out):
     ("--seed 98", "python 02_train_wetvae.py --seed 98 --experiment main"),
     ("--smoothing -0.1", "a number from 0 to 1"), ("--discount 1", "below 1"), ("--relabelled 2", "a number from 0 to 1"),
     ("--step_scale 0", "a number above 0"), ("--single_run 1,2.5", "--single_run is '2.5', but must be a whole number"),
-    ("--hidden 1e6", "lower --hidden or --batch"), ("--starts 1e10", "lower --starts"),
+    ("--hidden 1e6", "lower --hidden"), ("--threads 1e12", "--threads is '1e12', but must be a whole"),
+    ("--starts 1e10", "lower --starts"),
     ("--updates 0", "--updates"), ("--multi_run 5", "2 numbers")])
 def test_03_ends_in_one_line_before_training(flags, message, s3, inside, out, monkeypatch):
     monkeypatch.setattr(s3, "start_robots", lambda: pytest.fail("it trains"))
@@ -249,6 +250,8 @@ def test_a_stage_runs_whose_constants_have_lost_their_types(stage, small, tmp_pa
     (tmp_path / f"{stage}.py").write_text(bare)
     module = script(tmp_path / stage)
     assert len(module.__annotations__) < 5 and list(common.types_of(vars(module))) == list(KINDS[stage])
+    if stage == S3:  # what a policy, or a checkpoint, must share with the run that uses it
+        assert module.made_with() == STAGES[S3].made_with() and "DISCOUNT" in module.made_with()
     monkeypatch.setitem(STAGES, stage, module)
     done = small(stage)
     assert done.returncode == 0, done.stderr
@@ -274,10 +277,10 @@ def test_a_fraction_by_flag_over_a_whole_number_in_the_file_and_nonsense(stage, 
         setattr(module, name, 1)
         assert common.parse_flags(vars(module), [f"--{name.lower()}", "0.375"])[0][name] == 0.375 == getattr(module, name)
         assert common.convert("3e-1", kind, name) == 0.3 and type(common.convert(1, kind, name)) is float
-    if kind in (int, common.Count):
+    if kind in (int, common.Count, common.Threads):
         assert [common.convert(value, kind, name) for value in (512 / 2, "256.0", "2.56e2")] == [256] * 3
-        assert type(common.convert(1e4, kind, name)) is int
-        assert all(map(refused, (2.5, "1/2", 2 ** 63, "1e20", *([0] if kind is common.Count else []))))
+        assert type(common.convert(1e3, kind, name)) is int
+        assert all(map(refused, (2.5, "1/2", 2 ** 63, "1e20", *([0] if kind is not int else []))))
     if kind is not str:
         assert all(map(refused, ("many", None, float("nan"), [], {}, "1 2 3 x", "", 1e400)))
     if kind not in (str, common.Signed):
@@ -319,7 +322,7 @@ def runs(stage, name):
     range; the paper's."""
     kind, value = KINDS[stage][name], getattr(STAGES[stage], name)
     whole = int(value) if isinstance(value, float) and value % 1 == 0 else 1
-    found = {common.Count: [1], int: [0, 1], float: [0, 1, whole], common.Share: [0, 1], common.Positive: [1, whole],
+    found = {common.Count: [1], common.Threads: [1], int: [0, 1], float: [0, 1, whole], common.Share: [0, 1], common.Positive: [1, whole],
              common.Degrees: [0, 1, 180, whole], common.Signed: [-1, 0, 1]}.get(kind, [])
     if typing.get_origin(kind) is tuple:
         first = typing.get_args(kind)[0]
