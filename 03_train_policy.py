@@ -273,8 +273,8 @@ def check(source):
 def made_with():
     """What must be the same in a policy, or a checkpoint, and in the run that uses it."""
     made = common.made_by({name: globals()[name] for name in common.types_of(globals())})
-    others = {"ant.xml", "half_cheetah.xml"} - {f"{ROBOT}.xml"}
-    return {name: value for name, value in made.items() if name not in others and name not in MAY_DIFFER}
+    return {name: value for name, value in made.items() if name not in MAY_DIFFER
+            and (name == f"{ROBOT}.xml" or not name.endswith(".xml"))}
 
 
 def same_decoder(policy, decoder):
@@ -313,7 +313,8 @@ class Replay:
 
     def __init__(self, **widths):
         self.widths, self.added = widths, 0
-        self.table = torch.zeros(max(REPLAY, 2 * ROBOTS * SKILL_STEPS), sum(widths.values()))
+        block = ROBOTS * SKILL_STEPS  # a skill of all robots: whole ones, and at least two
+        self.table = torch.zeros(max(2, REPLAY // block) * block, sum(widths.values()))
 
     def add(self, unstable, **fields):
         """One step of all robots: fields (n, width) each. unstable (n,): whose step means nothing."""
@@ -332,11 +333,12 @@ class Replay:
         n = min(n, max(self.added, ROBOTS), len(self.table))
         return self.read((self.added - n + torch.arange(n)) % len(self.table))
 
-    def trajectories(self, n, steps, recent):
-        """n random stretches of `steps` steps of one robot, within the `recent` latest: (n, steps, width)."""
-        newest = max(ROBOTS * steps, min(self.added, recent, len(self.table)))  # at least one of each robot
-        last = self.added - 1 - torch.randint(newest - ROBOTS * (steps - 1), (n,))
-        return self.read((last[:, None] - ROBOTS * torch.arange(steps).flip(0)) % len(self.table))
+    def trajectories(self, n, recent):
+        """n random stretches of SKILL_STEPS steps of one robot, of the `recent` latest steps of all robots:
+        fields (n, SKILL_STEPS, width)."""
+        newest = max(ROBOTS * SKILL_STEPS, min(self.added, recent, len(self.table)))  # one of each robot
+        last = self.added - 1 - torch.randint(newest - ROBOTS * (SKILL_STEPS - 1), (n,))
+        return self.read((last[:, None] - ROBOTS * torch.arange(SKILL_STEPS).flip(0)) % len(self.table))
 
     def sample(self, n, recent=None):
         """n random steps, of all or of the `recent` latest ones."""
@@ -476,7 +478,7 @@ def train_sectar(_decoder, _names):
         if replay.added >= max(WARM_UP, ROBOTS * SKILL_STEPS):
             if sac.updates == 0:
                 sac.normalise(replay.read(slice(0, replay.added)).s)
-            x = replay.trajectories(MODEL_BATCH, SKILL_STEPS, RECENT).displacement / STEP_SCALE
+            x = replay.trajectories(MODEL_BATCH, RECENT).displacement / STEP_SCALE
             mean, log_var = vae["encoder"](x.flatten(1)).chunk(2, 1)  # theirs: a bidirectional LSTM
             kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1)
             sampled = mean + (0.5 * log_var).exp() * torch.randn_like(mean)

@@ -342,8 +342,8 @@ def collides(path, walls, radius):
     x0, x1, y0, y1 = torch.tensor(walls, dtype=torch.float32).view(-1, 4).T[..., None, None]  # (walls, 1, 1)
     half_x, half_y = (x1 - x0) / 2 + radius, (y1 - y0) / 2 + radius
     dx, dy = path.diff(dim=1).permute(2, 0, 1).contiguous() / 2  # half of each transition, (N, K)
-    x, y = (path[:, :-1] + path[:, 1:]).permute(2, 0, 1).contiguous() / 2  # its middle, ..
-    x, y = x - (x0 + x1) / 2, y - (y0 + y1) / 2  # .. seen from the middle of each wall, (walls, N, K)
+    x, y = (path[:, :-1] + path[:, 1:]).permute(2, 0, 1).contiguous() / 2  # its middle
+    x, y = x - (x0 + x1) / 2, y - (y0 + y1) / 2  # less that of each wall, (walls, N, K)
     along_x, along_y = x.abs() <= dx.abs() + half_x, y.abs() <= dy.abs() + half_y
     across = (dx * y - dy * x).abs() <= dx.abs() * half_y + dy.abs() * half_x
     return (along_x & along_y & across).any(0)
