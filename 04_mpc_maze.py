@@ -7,11 +7,10 @@ of 4.5, 4.1, 5.5, 9.0 m as printed; 1.7, 2.5, 4.8, 5.2 m planned with commands; 
 loop. The start is 26.8 m from the goal, and the shortest path around the walls is 36.4 m long.
 """
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from itertools import cycle, product
 from pathlib import Path
-from timeit import timeit
 from types import SimpleNamespace
 
 import common  # before mujoco: it chooses how mujoco renders
@@ -27,9 +26,6 @@ SEED: int = 0             # random seed of the trials
 OUT: str = "runs"         # folder that everything is written to
 THREADS: Threads = 2      # CPU threads of the physics
 DRAW: str = "fig03 fig06 fig08 fig14 fig17 gif"  # rows of DRAWINGS below
-DRIVE: bool = False       # true: only serve a page with a slider for each axis of z
-SECONDS: float = 0.0      # until the page ends by itself; 0: when it is closed
-PORT: int = 8080          # of the page, on this machine alone; 0: the first free one
 
 METHOD: str = "wedis"     # rows of METHODS below
 MAZES: str = "maze1 maze2"  # rows of MAZE below
@@ -50,8 +46,7 @@ Z_RANGE: float = 1.5      # skills ~ U(-Z_RANGE, Z_RANGE), but speed ~ U(0, Z_RA
 
 # Planning, App. A.1.4
 SAMPLES: tuple[Count, ...] = (10_000,)  # N, random sequences of which a plan is the best; one or more numbers
-LOOK_AHEAD: tuple[int, ...] = (0,)  # environment steps to plan ahead, one or more numbers (0: Table 2's H_P)
-POOL: Count = 65536       # skills, decoded once, that plans draw from (the paper: no pool)
+POOL: Count = 16384       # skills, decoded once, that plans draw from (the paper: no pool)
 PENALTY: float = 100.0    # w_p, for each transition of a sequence that collides
 REWARD_WEIGHT: float = 5.0  # w_r, sparse reward
 EPSILON: float = 5.0      # epsilon, metres: acceptable error; who ends nearer succeeds
@@ -63,10 +58,10 @@ STUDY = dict(METHOD="wedis wedis_s wedis_nts dads dads_speed sectar", POLICY_SEE
 EXPERIMENTS = {  # a row names the constants in which an experiment differs; its name is that of its CSV
     "mazes": {},
     "figure7": STUDY | dict(SAMPLES=(10, 100, 300, 1000, 3000, 10_000), DRAW="fig07"),  # stopped, it goes on
-    "matched": STUDY | dict(SAMPLES=1000, LOOK_AHEAD=(200, 600), DRAW=""),  # all but DADS look so far
+    # with --planned 99, so that dense plans too look as far ahead as those of WEDIS, 600 steps
+    "matched": STUDY | dict(METHOD="wedis_s wedis_nts", REWARDS="dense", SAMPLES=1000, DRAW=""),
     "fig18": dict(MAZES="s_maze obstacles", REWARDS="dense", MODES="printed closed", POLICY_SEEDS=(0, 1, 2),
                   DRAW="fig18"),
-    "drive": dict(DRIVE=True, MAZES="open", REWARDS="dense", MODES="commands"),
 }
 HULL = [(-7, -6, -11, 19), (31, 32, -11, 19), (-7, 32, -11, -10), (-7, 32, 18, 19)]  # x0, x1, y0, y1, metres
 MAZE = {  # walls, and the constants in which a maze differs; plan a row of your own with --mazes <its name>
@@ -78,7 +73,7 @@ MAZE = {  # walls, and the constants in which a maze differs; plan a row of your
     "obstacles": dict(WALLS=[(-7, -6, -7, 19), (31, 32, -7, 19), (-7, 32, -7, -6), (-7, 32, 18, 19),
                              (7, 9, 2.5, 4.5), (13, 15, 10, 12), (12, 14, 0, 2), (2, 4, 7, 9)],
                       GOAL=(17, 8), HOLD=50, LENGTH=5, PLANNED=1, EPISODE=250),
-    "open": dict(WALLS=[]),
+    "open": dict(WALLS=[]),  # for extras/drive.py
 }
 # App. A.1.4 gives DADS U(-1, 1), as it is trained, and SeCTAR U(-1.5, 1.5); Table 2 swaps the two.
 DADS = dict(MODES="printed", POLICY="ant_dads", EPISODE=300, HOLD=20, LENGTH=1, PLANNED=4, Z_RANGE=1)
@@ -97,11 +92,11 @@ METHODS = {  # Table 2
 # case: a Configuration (below), the constants of one run in lower case. policy: what 03 has saved, with
 # actor, decoder, names, relation, and scale, metres a step per trajectory unit.
 
-def plan_and_execute(case, policy, pool):
-    """Algorithm 2 for case.trials robots side by side; pool: of skill_pool. Returns their poses (steps + 1,
-    trials, nq), and a list with, for each i, the first skills z_1* of the best plans, (trials, M), and the
-    paths of these plans, (trials, horizon * T + 1, 2), metres."""
-    robots = common.Robots(maze_spec(case), case.trials, THREADS)
+def plan_and_execute(case, policy):
+    """Algorithm 2 for case.trials robots side by side. Returns their poses (steps + 1, trials, nq), and for
+    each i the first skills z_1* of the best plans, (trials, M), and the paths of these plans, (trials,
+    horizon * T + 1, 2), metres."""
+    robots, pool = common.Robots(maze_spec(case), case.trials, THREADS), skill_pool(case, policy)
     for n in range(case.trials):  # trial n of a policy starts alike for all methods, modes and mazes
         robots.reset([n], np.random.default_rng((case.seed, case.policy_seed, n)))
     torch.manual_seed(hash((case.seed, case.policy_seed, 1)))  # plans of its own for each policy
@@ -170,43 +165,35 @@ def planning_reward(path, case):
 def main():
     runs = check(*common.parse_flags(globals()))
     torch.set_num_threads(1)  # tensors are small here; THREADS are for the physics
-    if DRIVE:
-        from extras.drive import drive  # not in the paper
-        (case, policy, _), pool = runs[0], skill_pool(*runs[0][:2])
-        planner = partial(plan, case, policy, pool, case.planned)
-        return drive(case, policy, maze_spec(case), planner, SECONDS, PORT)
     table, start = Path(OUT) / "results" / f"{EXPERIMENT}.csv", time.time()
-    done, examples, pools = [], {}, {}
+    rows, old, examples = [], [], {}
     if table.exists() and set(DRAW.split()) <= {"fig06", "fig07", "fig14"}:  # others need the paths
-        done = [row.get("settings") for row in common.read_csv(table)]
+        old = common.read_csv(table)
     for case, policy, settings in runs:
-        if done.count(settings) == case.trials:
-            print(f"{case.title}: in {table} already, with the same settings")
-            continue
-        of_a_pool = case.length, case.z_range, case.pool, case.seed, case.policy_seed
-        key = policy.sha256, case.mode == "printed", *of_a_pool
-        if key not in pools:
-            pools[key] = skill_pool(case, policy)
-        poses, plans = plan_and_execute(case, policy, pools[key])
-        if not examples:
-            follow_one_skill(case, policy, poses, *plans[0])
-        example = case, poses[:, 0], [paths[0].numpy() for _, paths in plans]  # trial 0
-        examples.setdefault((case.maze, case.method, case.mode, case.reward), example)
-        distances = np.linalg.norm(poses[-1, :, :2] - case.goal, axis=1)
-        seconds = timeit(partial(plan, case, policy, pools[key], case.planned, torch.zeros(2)), number=3) / 3
-        row = dict(maze=case.maze, reward=case.reward, method=case.method, mode=case.mode,
-                   look_ahead=case.planned * case.hold * case.length, samples=case.samples, seed=case.seed,
-                   planning_ms=1e3 * seconds, policy_seed=case.policy_seed,
-                   policy=policy.sha256[:8], settings=settings)
-        common.update_csv(table, [row | dict(trial=n, final_distance=d, success=int(d < case.epsilon))
-                                 for n, d in enumerate(distances)], ("settings", "trial"))
-        print(f"{time.time() - start:4.0f} s  {case.title}", flush=True)
-    configurations, _, present = zip(*runs)
-    rows = [row for row in common.read_csv(table) if row.get("settings") in present]
-    print(f"wrote {table}; mean distance to the goal at the end, share of trials nearer than EPSILON:")
-    print_table(rows)
+        own = [row for row in old if row.get("settings") == settings]
+        kept = len(own) == case.trials
+        if not kept:
+            poses, plans = plan_and_execute(case, policy)
+            if not examples:
+                follow_one_skill(case, policy, poses, *plans[0])
+            example = case, poses[:, 0], [paths[0].numpy() for _, paths in plans]  # trial 0
+            examples.setdefault((case.maze, case.method, case.mode, case.reward), example)
+            distances = np.linalg.norm(poses[-1, :, :2] - case.goal, axis=1).tolist()
+            same = dict(maze=case.maze, reward=case.reward, method=case.method, mode=case.mode,
+                        look_ahead=case.planned * case.hold * case.length, samples=case.samples,
+                        seed=case.seed, policy_seed=case.policy_seed, policy=policy.sha256[:8],
+                        settings=settings)
+            own = [same | dict(trial=n, final_distance=distance, success=int(distance < case.epsilon))
+                   for n, distance in enumerate(distances)]
+            own = common.update_csv(table, own, ("settings", "trial"))
+        rows += own
+        distance = np.array([float(row["final_distance"]) for row in own])
+        print(f"{time.time() - start:4.0f} s  {case.title}: {distance.mean():.1f} m from the goal, "
+              f"{100 * np.mean(distance < case.epsilon):.0f} % within {case.epsilon:g} m" + " (known)" * kept,
+              flush=True)
+    print(f"wrote {table}")
     for name in DRAW.split():
-        DRAWINGS[name](rows, configurations, examples)
+        DRAWINGS[name](rows, [case for case, _, _ in runs], examples)
 
 
 @dataclass(frozen=True)
@@ -218,7 +205,7 @@ class Configuration:
     walls: tuple
     reward: str
     samples: int
-    planned: int  # skills that its plans look ahead, by its reward or LOOK_AHEAD
+    planned: int  # skills that its plans look ahead, by its reward
     policy: str
     policy_seed: int
     trials: int
@@ -240,21 +227,15 @@ class Configuration:
                 f"seed {self.policy_seed}")
 
 
-def configurations_of(method, maze, walls, v):
-    """The configurations of a method in a maze; v: its constants {NAME: value}."""
-    skill_steps, found = v["HOLD"] * v["LENGTH"], []
-    skills = v["EPISODE"] // skill_steps
-    for seed, mode, reward, steps, samples in product(v["POLICY_SEEDS"], v["MODES"].split(),
-                                                      v["REWARDS"].split(), v["LOOK_AHEAD"], v["SAMPLES"]):
-        planned = skills if reward == "sparse" else v["PLANNED"]  # App. A.1.4
-        if steps:
-            planned = max(1, steps // skill_steps)
-        found.append(Configuration(
-            method=method, mode=mode, maze=maze, walls=walls, reward=reward, samples=samples,
-            planned=min(planned, skills), policy=v["POLICY"], policy_seed=seed, trials=v["TRIALS"],
-            seed=v["SEED"], episode=v["EPISODE"], hold=v["HOLD"], length=v["LENGTH"], z_range=v["Z_RANGE"],
-            pool=v["POOL"], penalty=v["PENALTY"], reward_weight=v["REWARD_WEIGHT"], epsilon=v["EPSILON"],
-            radius=v["RADIUS"], goal=v["GOAL"]))
+def configurations_of(method, maze, v):
+    """The configurations of a method in a maze; v: its constants, and WALLS: {NAME: value}."""
+    same = {field.name: v.get(field.name.upper()) for field in fields(Configuration)}
+    skills, found = v["EPISODE"] // (v["HOLD"] * v["LENGTH"]), []  # H_E / (H_z T)
+    for mode, reward in product(v["MODES"].split(), v["REWARDS"].split()):
+        planned = skills if reward == "sparse" else min(v["PLANNED"], skills)  # App. A.1.4
+        of_both = same | dict(method=method, maze=maze, mode=mode, reward=reward, planned=planned)
+        for seed, samples in product(v["POLICY_SEEDS"], v["SAMPLES"]):
+            found.append(Configuration(**of_both | dict(policy_seed=seed, samples=samples)))
     return list(dict.fromkeys(found))
 
 
@@ -269,23 +250,24 @@ def check(config, given):
         return list(dict.fromkeys(found))
 
     words(DRAW or "fig06", "draw", DRAWINGS)
-    of_a_run = "EXPERIMENT OUT THREADS DRAW DRIVE SECONDS PORT METHOD MAZES".split()  # not for rows
+    of_a_run = "EXPERIMENT OUT THREADS DRAW METHOD MAZES".split()  # not for rows
     kinds, policies, runs = common.types_of(globals()), {}, []
     physics = {name: common.made_by({})[name] for name in ("FRAME_SKIP", "ant.xml")}  # a policy knows one
     for method, maze in product(words(METHOD, "method", METHODS), words(MAZES, "mazes", MAZE)):
-        of, own, v = f"{method} in {maze}", MAZE[maze].copy(), config.copy()
-        walls = own.pop("WALLS", [])
-        for name, value in (own | METHODS[method]).items():
-            if name not in config or name in of_a_run:
+        of, v = f"{method} in {maze}", config.copy()
+        for name, value in (MAZE[maze] | METHODS[method]).items():
+            if name not in kinds and name != "WALLS" or name in of_a_run:
                 stop(f"{of}: {name} is no constant that a row may set")
-            v[name] = convert(value, kinds[name], f"{of}: {name}")
+            v[name] = value if name == "WALLS" else convert(value, kinds[name], f"{of}: {name}")
         v |= given  # the last of the sources
+        walls = v.get("WALLS", ())
         words(v["MODES"], "modes", ["printed", "commands", "closed"])
         words(v["REWARDS"], "rewards", ["dense", "sparse"])
         if not isinstance(walls, (list, tuple)):
             stop(f"{of}: WALLS is {walls!r}, but must be a list of (x0, x1, y0, y1)")
-        walls = tuple(convert(wall, tuple[Signed, Signed, Signed, Signed], f"{of}: a wall") for wall in walls)
-        for x0, x1, y0, y1 in walls:
+        four = tuple[Signed, Signed, Signed, Signed]
+        v["WALLS"] = tuple(convert(wall, four, f"{of}: a wall") for wall in walls)
+        for x0, x1, y0, y1 in v["WALLS"]:
             if x0 >= x1 or y0 >= y1:
                 stop(f"{of}: a wall is {(x0, x1, y0, y1)}, but must be (x0, x1, y0, y1), x0 < x1, y0 < y1")
             for what, (x, y) in (("start", (0, 0)), ("goal", v["GOAL"])):
@@ -297,9 +279,7 @@ def check(config, given):
             stop(f"{of}: an episode of {v['EPISODE']} steps is shorter than a skill: --episode {skill_steps}")
         if whole < v["EPISODE"]:
             print(f"{of}: a skill takes {skill_steps} steps, so an episode of {v['EPISODE']} ends at {whole}")
-        if "fig07" in DRAW and len(v["LOOK_AHEAD"]) > 1:
-            stop("fig07 is for one number of --look_ahead")
-        for case in configurations_of(method, maze, walls, v):
+        for case in configurations_of(method, maze, v):
             key = case.policy, case.policy_seed
             if key not in policies:
                 policies[key] = SimpleNamespace(**common.load(OUT, "policy", *key, **physics))
@@ -310,14 +290,11 @@ def check(config, given):
                 stop(f"{case.title}: this mode is for policies of WEDIS: --modes printed")
             if policy.method == "dads" and case.length > 1:
                 stop(f"{case.title}: DADS predicts one step: --length 1")
-            points = case.samples * (case.planned * case.length + 1)
-            common.need_memory(40 * points, "--samples or --look_ahead")
-            common.need_memory(8 * case.pool * (case.length + 100), "--pool")
-            common.need_memory(case.trials * (120 * case.episode + 1e6), "--trials")
+            size = 40 * case.samples * (case.planned * case.length + 1) + 8 * case.pool * (case.length + 100)
+            size += case.trials * (120 * case.episode + 1e6)
+            common.need_memory(size, "--samples, --pool or --trials")
             settings = common.digest(common.made_by(asdict(case)) | dict(sha256=policy.sha256))
             runs.append((case, policy, settings))
-    if DRIVE and len(runs) > 1:
-        stop("drive is for one of each: --mazes, --modes, --policy_seeds, --samples, --look_ahead")
     return runs
 
 
@@ -349,16 +326,12 @@ def collides(path, walls, radius):
     return (along_x & along_y & across).any(0)
 
 
-# -------- measuring
-
 def follow_one_skill(case, policy, poses, z, paths):
     """Print the first plan's skill of trial 0, its predicted and its executed end."""
-    predicted, executed = paths[0, case.length].numpy(), poses[case.hold * case.length, 0, :2]
-    values = zip(policy.names or map("z{}".format, range(z.shape[1])), z[0])
+    ends = *paths[0, case.length], *poses[case.hold * case.length, 0, :2]
     print(f"the first skill of trial 0, {case.title}:")
-    print("  z: " + ", ".join(f"{name} {value:.2f}" for name, value in values))
-    print("  predicted end ({:.2f}, {:.2f}) m, executed ({:.2f}, {:.2f}) m, ".format(*predicted, *executed)
-          + f"{np.linalg.norm(predicted - executed):.2f} m apart")
+    print("  z:", *(f"{value:.2f}" for value in z[0]), f" ({', '.join(policy.names)})")
+    print("  predicted end ({:.2f}, {:.2f}) m, executed ({:.2f}, {:.2f}) m".format(*ends))
 
 
 def values_of(rows, column, **where):
@@ -376,18 +349,6 @@ def resampled_means(values, rng, draws=10_000):
     policies, trials = values.shape
     drawn = rng.integers(policies, size=(draws, policies, 1))
     return values[drawn, rng.integers(trials, size=(draws, policies, trials))].mean((1, 2))
-
-
-def print_table(rows):
-    """A line per maze, reward, method, N and look-ahead, the modes side by side."""
-    form, lines = "{maze:10} {reward:7} {method:10} N {samples:>5}, {look_ahead:>3} steps ahead", {}
-    for row in rows:
-        end = float(row["final_distance"]), float(row["success"])
-        lines.setdefault(form.format(**row), {}).setdefault(row["mode"], []).append(end)
-    for line, modes in lines.items():
-        means = [(mode, *np.mean(ends, 0)) for mode, ends in modes.items()]
-        cells = [f"{mode} {distance:4.1f} m {100 * success:3.0f} %" for mode, distance, success in means]
-        print(line, *cells, sep=" | ")
 
 
 # -------- drawing; examples: {(maze, method, mode, reward): (configuration, poses, paths of the plans)}
@@ -424,25 +385,23 @@ def draw_fig06(rows, configurations, examples):
 
 
 def draw_fig07(rows, configurations, examples):
-    """Fig 7: mean final distance against N, with its 95 % interval over policies and trials; dashed: the
-    goal's distance from the origin."""
-    panels = {(case.maze, case.reward): np.hypot(*case.goal) for case in configurations}
+    """Fig 7: mean final distance against N, with its 95 % interval over policies and trials."""
+    panels = dict.fromkeys((case.maze, case.reward) for case in configurations)
     okabe_ito = cycle([BLUE, RED, "#009E73", "#E69F00", "#CC79A7", "#56B4E9"])
     colours = dict(zip(dict.fromkeys(case.method for case in configurations), okabe_ito))
     marks, rng = dict(printed="o-", commands="s--", closed="^:"), np.random.default_rng(0)
     figure, axes = plt.subplots(1, len(panels), figsize=(3.6 * len(panels), 4), sharey=True, squeeze=False)
-    for ax, ((maze, reward), distance) in zip(axes[0], panels.items()):
-        ax.axhline(distance, ls="--", color=GREY)
+    for ax, (maze, reward) in zip(axes[0], panels):
         for method, mode in dict.fromkeys((case.method, case.mode) for case in configurations):
-            found, where = {}, dict(maze=maze, reward=reward, method=method, mode=mode)
+            found, where = [], dict(maze=maze, reward=reward, method=method, mode=mode)
             for samples in sorted({case.samples for case in configurations}):
                 values = values_of(rows, "final_distance", samples=samples, **where)
                 if values.size:
                     interval = np.quantile(resampled_means(values, rng), [0.025, 0.975])
-                    found[samples] = values.mean(), *interval
-            mean, low, high = np.array(list(found.values())).reshape(-1, 3).T
-            ax.fill_between(list(found), low, high, color=colours[method], alpha=0.12)
-            ax.plot(list(found), mean, marks[mode], color=colours[method], ms=4, label=f"{method}, {mode}")
+                    found.append([samples, values.mean(), *interval])
+            samples, mean, low, high = np.array(found).reshape(-1, 4).T
+            ax.fill_between(samples, low, high, color=colours[method], alpha=0.12)
+            ax.plot(samples, mean, marks[mode], color=colours[method], ms=4, label=f"{method}, {mode}")
         ax.set(xscale="log", xlabel="N, samples per plan", title=f"{maze}, {reward} reward")
     axes[0, 0].set(ylim=(0, None), ylabel="final distance (m)")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5)

@@ -490,7 +490,8 @@ def load(out, kind, experiment, seed, **same):
 
 
 def update_csv(path, rows, key):
-    """Write rows (dicts), in place of those in the file that agree with one of them on the columns in key."""
+    """Write rows (dicts), in place of those in the file that agree with one of them on the columns in key.
+    Returns them as text, as read_csv does."""
     new = [{k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in row.items()} for row in rows]
     replaced = {tuple(row[k] for k in key) for row in new}
     with contextlib.ExitStack() as at_the_end:  # seeds trained side by side share a file: lock its folder
@@ -510,6 +511,7 @@ def update_csv(path, rows, key):
         writer.writeheader()
         writer.writerows(rows)
         write_whole(path, text.getvalue().encode())
+    return new
 
 
 def read_csv(path):

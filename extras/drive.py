@@ -1,13 +1,19 @@
 """Drive the Ant by hand, in a web page with a slider for each axis of z. Not in the paper.
 
-Started by: python 04_mpc_maze.py --experiment drive [--mazes maze1] [--seconds 30] [--port 8080]
+python extras/drive.py [--mazes maze1] [--port 8080] [--seconds 30] [any flag of 04_mpc_maze.py]
+--port 0: the first free one; --seconds: until the page ends by itself, 0: when it is closed.
 """
+import importlib
 import logging
 import signal
+import sys
 import threading
 import time
+from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import common
 import mujoco
 import numpy as np
@@ -141,3 +147,22 @@ def drive(config, policy, spec, plan_to_goal, seconds, port):
     except (ImportError, AttributeError, TypeError, KeyError, RuntimeError, OverflowError) as error:
         common.stop(f"cannot drive in a browser with mujoco {mujoco.__version__} at --port {port}: {error}")
     print(f"{steps} steps, {steps / (time.monotonic() - start):.2f} a second")
+
+
+def main():
+    stage = importlib.import_module("04_mpc_maze")
+    vars(stage).update(MAZES="open", REWARDS="dense", MODES="commands", DRAW="", SECONDS=0.0, PORT=8080)
+    stage.__annotations__ |= dict(SECONDS=float, PORT=int)
+    stage.__doc__ = __doc__
+    runs = stage.check(*common.parse_flags(vars(stage)))
+    if len(runs) > 1:
+        common.stop("drive with one of each: "
+                    "--method, --mazes, --modes, --rewards, --policy_seeds and --samples")
+    torch.set_num_threads(1)
+    case, policy, _ = runs[0]
+    planner = partial(stage.plan, case, policy, stage.skill_pool(case, policy), case.planned)
+    drive(case, policy, stage.maze_spec(case), planner, stage.SECONDS, stage.PORT)
+
+
+if __name__ == "__main__":
+    main()

@@ -56,7 +56,7 @@ def measured(stage3, stage4, c, policy):
         stage3.roll_out(policy, z, stage3.SINGLE_RUN, False), stage3.predicted_path(policy, z, stage3.SINGLE_RUN)))
     row["slowest_speed"], row["fastest_speed"] = (executed / predicted).tolist()
     row["updates_per_second"] = policy.updates / policy.seconds
-    poses, _ = stage4.plan_and_execute(c, policy, stage4.skill_pool(c, policy))
+    poses, _ = stage4.plan_and_execute(c, policy)
     distances = np.linalg.norm(poses[-1, :, :2] - c.goal, axis=1)
     return row | dict(maze1_distance_m=float(distances.mean()), maze1_success=float((distances < c.epsilon).mean()))
 

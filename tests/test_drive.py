@@ -16,7 +16,7 @@ import common
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, load_policy
+from conftest import ROOT, load_policy, script
 from test_maze import make_policy
 from websockets.exceptions import ConnectionClosed, ConnectionClosedError, InvalidStatus
 from websockets.sync.client import connect
@@ -30,10 +30,10 @@ def folder(tmp_path_factory):
 
 
 def run(folder, *flags, before=""):
-    """Stage 4 in a process of its own; before: Python that runs first."""
-    argv = ["04_mpc_maze.py", "--experiment", "drive", "--out", str(folder), "--pool", "64", *flags]
+    """The page in a process of its own; before: Python that runs first."""
+    argv = ["drive.py", "--out", str(folder), "--pool", "64", *flags]
     code = f"import sys\nsys.path.insert(0, {str(ROOT)!r})\n{before}\nimport runpy\nsys.argv = {argv!r}\n"
-    code += f"runpy.run_path({str(ROOT / '04_mpc_maze.py')!r}, run_name='__main__')"
+    code += f"runpy.run_path({str(ROOT / 'extras' / 'drive.py')!r}, run_name='__main__')"
     return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -90,6 +90,38 @@ def test_a_method_without_axes_is_one_line(folder):
     process = run(folder, "--method", "dads", "--modes", "printed", "--policy_seeds", "0")
     _, err = process.communicate(timeout=60)
     assert process.returncode == 2 and len(err.splitlines()) == 1 and "driving needs WEDIS" in err, err
+
+
+@pytest.mark.parametrize("flags, line", [
+    ("--mazes maze1,maze2", "unknown 'maze1,maze2' in --mazes"), ("--policy_seeds 0,0", "http"), ("--port x", "--port is 'x'"),
+    ("--samples 1,2", "drive with one of each"), ("--seconds -1", "--seconds is '-1'")])
+def test_what_makes_no_sense_is_one_line(folder, flags, line):
+    flags = flags.split()
+    if line == "http":  # the same policy twice is one
+        flags += ["--seconds", "1", "--port", "0"]
+    out, err = run(folder, *flags).communicate(timeout=60)
+    assert line in (out if line == "http" else err) and len(err.splitlines()) == (line != "http"), err
+
+
+def test_the_planner_plans_with_commands_from_where_the_robot_is(s4, folder, monkeypatch):
+    got = []
+    drive = script("extras/drive")
+    monkeypatch.setattr(drive, "drive", lambda *given: got.append(given))
+    monkeypatch.setattr(sys, "argv", ["drive.py", "--out", str(folder), "--mazes", "maze1", "--seconds", "3", "--port", "1",
+                                      "--samples", "50", "--pool", "64"])
+    before = {name: value for name, value in vars(drive.importlib.import_module("04_mpc_maze")).items() if name.isupper()}
+    try:
+        drive.main()
+    finally:
+        vars(sys.modules["04_mpc_maze"]).update(before)
+    (config, policy, spec, plan_to_goal, seconds, port), = got
+    assert (config.mode, config.reward, config.maze, policy.method, seconds, port) == ("commands", "dense", "maze1", "wedis", 3.0, 1)
+    assert len(spec.compile().geom_pos) > len(config.walls)
+    place = torch.tensor([1.0, 2.0])
+    z, path = plan_to_goal(place)
+    assert z.shape == (3,) and path.shape == (16, 2) and torch.equal(path[0], place)
+    step = config.hold * policy.scale * common.commands_of(policy, z[None], 5)[0]
+    torch.testing.assert_close(path[:6].diff(dim=0), step, atol=1e-5, rtol=1e-4)
 
 
 def test_a_port_in_use_is_one_line(folder):
