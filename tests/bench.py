@@ -2,7 +2,8 @@
 
 python tests/bench.py            3 minutes. Critic updates/s at two layers of 256 and batches of 256 against Stable-Baselines3's
                                  gradient steps (ours: actor and value network in each second one); environment steps/s against
-                                 Gymnasium's vector Ant-v5 and bare mj_step; updates/s of the whole loop on one core and on two.
+                                 Gymnasium's vector Ant-v5 and bare mj_step; plans/s of 04 in Maze 1, dense, with 1000 and 10,000
+                                 samples; updates/s of the whole loop on one core and on two.
                                  One thread, or as it says; the median of five rounds in turns, a busy moment hits all.
 python tests/bench.py tracking   as many minutes as the shipped ant_semi policies took: Stable-Baselines3's SAC with its defaults on
                                  the same task (robot, base frame, commands, reward), with as many threads, then its error beside ours.
@@ -86,6 +87,15 @@ def gymnasium_vector():
     envs.reset()
     action = np.random.uniform(-1, 1, (8, 8))
     return lambda: envs.step(action)
+
+
+def plans(samples):
+    """One plan of Algorithm 2 from the start: three skills, in Maze 1, dense, with the shipped policy."""
+    stage = script("04_mpc_maze")
+    flags = f"--mazes maze1 --rewards dense --modes commands --samples {samples} --out {tempfile.gettempdir()}"
+    (case, policy, _), = stage.check(*common.parse_flags(vars(stage), flags.split()))
+    pool = stage.skill_pool(case, policy)
+    return lambda: stage.plan(case, policy, pool, case.planned, torch.zeros(2))
 
 
 def whole_loop(threads):
@@ -175,13 +185,15 @@ def compare_tracking():
 
 def speeds():
     measures = dict(ours=rate(our_updates(), 1), sb3=rate(sb3_updates(), 4), robots=rate(our_robots(1), 64),
-                    robots2=rate(our_robots(2), 64), mj_step=rate(bare_mj_step(), 1), vector=rate(gymnasium_vector(), 8))
+                    robots2=rate(our_robots(2), 64), plans=rate(plans(1000), 1),
+                    more=rate(plans(10_000), 1), mj_step=rate(bare_mj_step(), 1), vector=rate(gymnasium_vector(), 8))
     rounds = [{name: measure() for name, measure in measures.items()} for _ in range(ROUNDS)]
     v = {name: float(np.median([one[name] for one in rounds])) for name in measures}
     return [("SAC updates", v["ours"], v["sb3"], "Stable-Baselines3 SAC", "updates/s, one thread"),
             ("Ant steps", v["robots"], v["vector"], "Gymnasium SyncVectorEnv of 8 Ant-v5", "environment steps/s, one thread"),
             ("Ant steps", v["robots"], v["mj_step"], "bare mj_step of the same Ant", "environment steps/s, one thread"),
             ("Ant steps, two threads", v["robots2"], v["robots"], "ours on one thread", "environment steps/s"),
+            ("plans, N = 1000", v["plans"], v["more"], "ours, N = 10,000", "plans of three skills/s, one thread"),
             ("whole training loop", whole_loop(2), whole_loop(1), "ours on one core", "updates/s on two cores")]
 
 

@@ -1,4 +1,4 @@
-// By hand: the page of `04_mpc_maze.py --experiment drive` in a real browser. Needs Debian's chromium and
+// By hand: the page of `extras/drive.py` in a real browser. Needs Debian's chromium and
 // `npm install playwright-core`. Run: node tests/drive_browser.js PYTHON [maze1]
 // It moves z_speed with the mouse, prints how fast the Ant then runs, and writes runs/figures/drive.png.
 const { chromium } = require('playwright-core');
@@ -14,8 +14,8 @@ def logged(self, action):
     print("at", time.monotonic(), *self.qpos[0, :2], flush=True)
     return step(self, action)
 common.Robots.step = logged
-sys.argv = ["04_mpc_maze.py", "--experiment", "drive", "--port", "0"] + sys.argv[1:]
-runpy.run_path(${JSON.stringify(path.join(root, '04_mpc_maze.py'))}, run_name="__main__")`;
+sys.argv = ["drive.py", "--port", "0"] + sys.argv[1:]
+runpy.run_path(${JSON.stringify(path.join(root, 'extras', 'drive.py'))}, run_name="__main__")`;
 const walls = process.argv[3] ? ['--mazes', process.argv[3]] : [];
 const python = spawn(process.argv[2] || 'python', ['-c', code, ...walls]);
 let text = '';

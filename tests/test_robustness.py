@@ -183,7 +183,7 @@ WITH = {  # what else is set so that a constant means something, or fits
     **{(S3, name): DADS for name in "MODEL_BATCH MODEL_UPDATES PRIOR_SAMPLES RECENT".split()},
     (S3, "Z_DIM"): SECTAR, (S3, "EPISODE"): dict(SKILL_STEPS=1), (S2, "EPOCHS"): dict(BATCH=300),
     (S1, "ACCELERATION"): dict(FACTORS="speed acceleration")}
-DRIVING = ("OUT", "DRIVE", "SECONDS", "PORT")  # test_drive.py
+HERE = ("OUT",)  # of the test
 DATA = dict(names=np.array(["speed", "direction", "curvature"]), ranges=np.array([(0, 1), (-1.57, 1.57), (-0.5, 0.5)]))
 DRAWN = np.random.default_rng(0).uniform(DATA["ranges"][:, 0], DATA["ranges"][:, 1], (300, 3))
 DRAWN[::5, 2] = 0
@@ -311,9 +311,9 @@ ONE_LINE = {  # values that are in range and rightly end in one line; of a learn
     (S1, "ACCELERATION"): [0], (S3, "DISCOUNT"): [1], (S4, "EPISODE"): [1],
     (S2, "SEED"): [1]}  # there is no such data set
 OFF = {  # constants that 0 switches off, whatever their declared types
-    S1: "SPEED_LOW STRAIGHT", S2: "GAMMA BETA BETA_WARM_UP",
+    S1: "SPEED_LOW STRAIGHT", S2: "GAMMA BETA",
     S3: "RELABELLED DECAY_FROM AVERAGED DISCOUNT SMOOTHING REWARD_SCALE TEMPERATURE FLOOR_START FLOOR_END",
-    S4: "LOOK_AHEAD PENALTY REWARD_WEIGHT EPSILON RADIUS Z_RANGE"}
+    S4: "PENALTY REWARD_WEIGHT EPSILON RADIUS Z_RANGE"}
 MAY_DIVERGE = [(S2, "LEARNING_RATE"), (S3, "LEARNING_RATE")]
 
 
@@ -349,7 +349,7 @@ def test_the_papers_values_are_found():
 def test_values_that_must_run(stage, name, small):
     """Exit 0: 0 switches off, 1 of each count, the paper's value, whole numbers for fractions. Others that are in range, and
     make no sense, are listed and end in one line."""
-    for value in runs(stage, name) if name not in DRIVING else ():
+    for value in runs(stage, name) if name not in HERE else ():
         done = small(stage, name, value)
         if value in ONE_LINE.get((stage, name), []):
             assert one_line(done, 2), (value, done.stderr)
@@ -372,7 +372,7 @@ def test_what_is_switched_off_in_common_runs(stage, name, small, out, monkeypatc
 
 
 @pytest.mark.parametrize("flags", [["--goal", "3 -4"], ["--goal", "-3,4"], ["--goal", "-.5 -3e0"], ["--samples", "3,5"],
-                                   ["--look_ahead", "10 20"], ["--penalty", "0", "--radius", "0"], ["--goal=-3 4"]])
+                                   ["--samples", "10 20"], ["--penalty", "0", "--radius", "0"], ["--goal=-3 4"]])
 def test_numbers_by_flag_in_the_mazes(flags, small, out):
     done = small(S4, "", None, *flags)
     assert done.returncode == 0 and not done.stderr, done.stderr
@@ -411,7 +411,7 @@ def test_mazes_are_for_policies_that_learnt_with_the_same_physics(what, small, o
 def test_every_constant_can_be_changed_in_the_file(stage, name, small):
     """It works, or ends in one line: never a traceback."""
     value = getattr(STAGES[stage], name)
-    if name in DRIVING:
+    if name in HERE:
         return
     if isinstance(value, bool):
         changes = [not value]
