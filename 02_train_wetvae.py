@@ -18,7 +18,7 @@ from torch import nn
 from torch.nn import functional as F
 
 import common
-from common import (MULTI, Count, Decoder, Positive, Threads, commands_of, factors_of, load, plt, stop,
+from common import (MULTI, Count, Decoder, Positive, Share, Threads, commands_of, factors_of, load, plt, stop,
                     weak_labels)
 
 EXPERIMENT: str = "fig04_latent_traversals"  # a figure of FIGURES, with all its models, or a model of MODELS
@@ -33,14 +33,15 @@ LABELLED: bool = True        # false: without the weak labels, the trajectory VA
 OWN_AXIS: bool = True        # label m is read from latent m alone (the paper: from all of z; axes can mix)
 GAMMA: float = 10.0          # weight of the label log-likelihoods, Eq. 4
 BETA: float = 9.0            # weight of the KL divergence, Eq. 4
+BETA_WARM_UP: Share = 0.5    # share of the updates in which beta grows from 0; without it an axis can be lost
 HIDDEN: Count = 64           # width of every unit in Fig 1
 BATCH: Count = 512           # trajectories per update (the paper: 2048)
 EPOCHS: Count = 12           # passes over the data (the paper: 300)
 LEARNING_RATE: Positive = 2e-3  # of Adam, falls linearly to 0 (the paper: 2e-4, fixed)
 Z_RANGE: Positive = 1.5      # relation functions are found, and traversals drawn, from -Z_RANGE to Z_RANGE
 
-NONE = dict(LABELLED=False, GAMMA=0, BETA=1)  # with BETA 9 its latents collapse
-PRINTED = dict(OWN_AXIS=False)  # Eq. 4 as printed; mixes axes with some seeds
+NONE = dict(LABELLED=False, GAMMA=0, BETA=1, BETA_WARM_UP=0)  # with BETA 9 its latents collapse
+PRINTED = dict(OWN_AXIS=False, BETA_WARM_UP=0)  # Eq. 4 as printed; mixes axes with some seeds
 POLAR = dict(DATA="polar", LABELS="speed direction")
 LINE = dict(DATA="speed_acc", LABELS="speed acceleration", EPOCHS=24, BETA=4, Z_RANGE=1)
 FOUR = dict(DATA="four_factors", LABELS="speed direction curvature acceleration", EPOCHS=60, BETA=4)
@@ -49,8 +50,9 @@ MODELS = {  # a row names the constants, from DATA to Z_RANGE, in which a model 
     "main": {}, "main_none": NONE, "full": dict(DATA="full"), "four_factors": FOUR,
     "polar": POLAR, "polar_cartesian": POLAR | dict(LABELS="x y"),
     "polar_none": POLAR | NONE | dict(LABELS="x y"), "speed_acc": LINE, "speed_acc_none": LINE | NONE,
-    # To be run with ten seeds: as shipped, Eq. 4 as printed (24 epochs), without labels
-    "seeds": {}, "seeds_plain": PRINTED | dict(EPOCHS=24), "seeds_none": NONE, "beta_gamma": PRINTED,
+    # To be run with ten seeds: own axes and beta's warm-up, one of the two, neither (24 epochs), no labels.
+    "seeds": {}, "seeds_own_axis": dict(BETA_WARM_UP=0), "seeds_warm_up": dict(OWN_AXIS=False),
+    "seeds_plain": PRINTED | dict(EPOCHS=24), "seeds_none": NONE, "beta_gamma": PRINTED,
 } | {f"beta_gamma_b{beta}_g{gamma}": PRINTED | dict(BETA=beta, GAMMA=gamma) for beta, gamma in WEIGHTS}
 FIGURES = {  # a column of a figure: title ("": the model's name), model, T of its traversals (0: of the data)
     "fig04_latent_traversals": [
@@ -150,7 +152,10 @@ def train(x, one_hot, y, names, hyper):
         for i, rows in enumerate(torch.randperm(len(x)).split(hyper.batch)[:updates]):  # Alg. 1: B ~ D
             log_p_tau, log_p_y, kl = objective(*networks, x[rows], one_hot[rows], y[rows])  # y: supervision
             progress = (epoch + i / updates) / hyper.epochs
-            loss = -(log_p_tau + hyper.gamma * log_p_y - hyper.beta * kl)  # Eq. 4; then optimize phi, theta
+            beta = hyper.beta
+            if progress < hyper.beta_warm_up:
+                beta *= progress / hyper.beta_warm_up
+            loss = -(log_p_tau + hyper.gamma * log_p_y - beta * kl)  # Eq. 4; Alg. 1: optimize phi, theta
             optimizer.param_groups[0]["lr"] = hyper.learning_rate * (1 - progress)
             optimizer.zero_grad()
             loss.backward()

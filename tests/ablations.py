@@ -33,7 +33,7 @@ MEASURES = {  # column -> in words, format, factor
     "maze1_success": ("Maze 1, success, %", ".0f", 100),
 }
 IN_EACH_CELL = ("tracking_error", "tracking_error_closed", "fall_rate")
-LABEL_MODELS = dict(own_axis="plain")  # row `seeds_plain` of 02
+LABEL_MODELS = dict(own_axis="warm_up", beta_warm_up="own_axis", own_axis_and_warm_up="plain")  # rows `seeds` of 02
 
 
 # ---------------------------------------------------------------- measuring

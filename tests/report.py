@@ -222,7 +222,9 @@ def fig4():
     """The models of three factors: purity (coverage), mean of the seeds."""
     rows = []
     for experiment, labels, name in (("main", "main", "WET-VAE, the shipped ones"), ("seeds", "seeds", "WET-VAE"),
-                                     ("seeds", "plain", "... labels read from all of z: Eq. 4 as printed (24 epochs)"),
+                                     ("seeds", "own_axis", "... without beta's warm-up"),
+                                     ("seeds", "warm_up", "... labels read from all of z"),
+                                     ("seeds", "plain", "... with neither own axes nor warm-up: Eq. 4 as printed (24 epochs)"),
                                      ("main", "none", "trajectory VAE, the shipped one"), ("seeds", "none", "trajectory VAE")):
         pure, cover, factors = purities(experiment, labels)
         if len(pure):

@@ -213,7 +213,7 @@ def hyper(**changed):
     return STAGE.hyperparameters("main", config, {name.upper(): value for name, value in changed.items()})
 
 
-def test_beta_is_fixed_and_the_learning_rate_falls(s2, monkeypatch):
+def test_beta_grows_over_the_first_half_and_the_learning_rate_falls(s2, monkeypatch):
     betas, rates, real = [], [], torch.optim.Adam
 
     class Adam(real):
@@ -227,9 +227,9 @@ def test_beta_is_fixed_and_the_learning_rate_falls(s2, monkeypatch):
         return kl * 0, 0, kl
     monkeypatch.setattr(s2, "objective", objective)
     monkeypatch.setattr(torch.optim, "Adam", Adam)
-    settings = hyper(epochs=2, batch=2, learning_rate=1e-3, beta=8.0, hidden=4, labelled=False)
+    settings = hyper(epochs=2, batch=2, learning_rate=1e-3, beta=8.0, beta_warm_up=0.5, hidden=4, labelled=False)
     s2.train(torch.zeros(8, 5, 2), torch.zeros(8, 0), torch.zeros(8, 3), ["speed", "direction", "curvature"], settings)
-    assert betas == [8] * 8
+    assert betas == pytest.approx([0, 2, 4, 6, 8, 8, 8, 8])
     assert rates == pytest.approx(1e-3 * (1 - np.arange(8) / 8))
 
 
@@ -297,7 +297,7 @@ def test_the_shipped_decoder_means_what_its_axes_say(tmp_path, experiment, most)
 
 GROUPS = {  # experiment and labels in results/wetvae.csv: a model beside which others differ, and in what
     "main": ("main", "main"), "main_none": ("main", "none"), "polar_cartesian": ("polar", "cartesian"), "polar": ("polar", "polar"),
-    "full": ("full", "full"), "speed_acc_none": ("speed_acc", "none"), "seeds_plain": ("seeds", "plain"),
+    "full": ("full", "full"), "speed_acc_none": ("speed_acc", "none"), "seeds_own_axis": ("seeds", "own_axis"),
     "beta_gamma": ("beta_gamma", "beta_gamma"), "beta_gamma_b3_g10": ("beta_gamma", "b3_g10")}
 
 
@@ -385,7 +385,7 @@ def test_the_example_of_the_data_goes_through_encoder_and_axes(s2, inside, out, 
 
 
 def test_beta_gamma_is_eq_4_as_printed():
-    as_printed = dict(BETA=9, GAMMA=10, OWN_AXIS=False)
+    as_printed = dict(BETA=9, GAMMA=10, OWN_AXIS=False, BETA_WARM_UP=0)
     config = {name: getattr(STAGE, name) for name in common.types_of(vars(STAGE))}
     assert STAGE.hyperparameters("beta_gamma", config, {}) == STAGE.hyperparameters("main", config, as_printed)
     assert STAGE.hyperparameters("beta_gamma_b1_g10", config, {}) == STAGE.hyperparameters("main", config, as_printed | dict(BETA=1))

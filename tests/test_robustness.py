@@ -311,7 +311,7 @@ ONE_LINE = {  # values that are in range and rightly end in one line; of a learn
     (S1, "ACCELERATION"): [0], (S3, "DISCOUNT"): [1], (S4, "EPISODE"): [1],
     (S2, "SEED"): [1]}  # there is no such data set
 OFF = {  # constants that 0 switches off, whatever their declared types
-    S1: "SPEED_LOW STRAIGHT", S2: "GAMMA BETA",
+    S1: "SPEED_LOW STRAIGHT", S2: "GAMMA BETA BETA_WARM_UP",
     S3: "RELABELLED DECAY_FROM AVERAGED DISCOUNT SMOOTHING REWARD_SCALE TEMPERATURE FLOOR_START FLOOR_END",
     S4: "PENALTY REWARD_WEIGHT EPSILON RADIUS Z_RANGE"}
 MAY_DIVERGE = [(S2, "LEARNING_RATE"), (S3, "LEARNING_RATE")]
