@@ -4,7 +4,7 @@ In: policy_<POLICY>_seed<n>.pt of stage 3. Out: <OUT>/results/<EXPERIMENT>.csv, 
   python 04_mpc_maze.py   Fig 3, 6, 8, 14, 17 and GIFs, 88 s on two cores; others: --experiment figure7 ..
 Expect, with --policy_seeds 0,1,2, mean final distances over 3 x 50 trials (dense maze 1, 2; sparse maze 1, 2)
 of 4.5, 4.1, 5.5, 9.0 m as printed; 1.7, 2.5, 4.8, 5.2 m planned with commands; 0.4, 0.5, 3.8, 3.8 m in closed
-loop. The start is 26.8 m from the goal, and the shortest path around the walls is 36.4 m long.
+loop. The start is 26.8 m from the goal; the shortest path that stays 1 m from the walls is 36.4 m long.
 """
 import time
 from dataclasses import asdict, dataclass, fields
@@ -30,7 +30,7 @@ DRAW: str = "fig03 fig06 fig08 fig14 fig17 gif"  # rows of DRAWINGS below
 METHOD: str = "wedis"     # rows of METHODS below
 MAZES: str = "maze1 maze2"  # rows of MAZE below
 REWARDS: str = "dense sparse"  # Sec. 6.2
-# printed: planned with one decoder run of T transitions; executed by sampled actions, its place not fed back.
+# printed: planned with one decoder run of T transitions; sampled actions, no feedback within a skill.
 # commands: planned with what the robot is commanded. closed: as commands, with feedback and mean actions.
 MODES: str = "printed commands closed"  # one or more of the three
 POLICY: str = "ant_semi"  # experiment of 03
@@ -47,7 +47,7 @@ Z_RANGE: float = 1.5      # skills ~ U(-Z_RANGE, Z_RANGE), but speed ~ U(0, Z_RA
 # Planning, App. A.1.4
 SAMPLES: tuple[Count, ...] = (10_000,)  # N, random sequences of which a plan is the best; one or more numbers
 POOL: Count = 16384       # skills, decoded once, that plans draw from (the paper: no pool)
-PENALTY: float = 100.0    # w_p, for each transition of a sequence that collides
+PENALTY: float = 100.0    # w_p, for each transition that collides
 REWARD_WEIGHT: float = 5.0  # w_r, sparse reward
 EPSILON: float = 5.0      # epsilon, metres: acceptable error; who ends nearer succeeds
 RADIUS: float = 1.0       # metres by which the planner grows the walls, for the Ant's legs (not in the paper)
@@ -58,8 +58,8 @@ STUDY = dict(METHOD="wedis wedis_s wedis_nts dads dads_speed sectar", POLICY_SEE
 EXPERIMENTS = {  # a row names the constants in which an experiment differs; its name is that of its CSV
     "mazes": {},
     "figure7": STUDY | dict(SAMPLES=(10, 100, 300, 1000, 3000, 10_000), DRAW="fig07"),  # stopped, it goes on
-    # with --planned 99, so that dense plans too look as far ahead as those of WEDIS, 600 steps
-    "matched": STUDY | dict(METHOD="wedis_s wedis_nts", REWARDS="dense", SAMPLES=1000, DRAW=""),
+    # with --planned 99 --samples 1000: dense plans that look as far ahead as those of WEDIS, 600 steps
+    "matched": STUDY | dict(METHOD="wedis_s wedis_nts", REWARDS="dense", DRAW=""),
     "fig18": dict(MAZES="s_maze obstacles", REWARDS="dense", MODES="printed closed", POLICY_SEEDS=(0, 1, 2),
                   DRAW="fig18"),
 }
@@ -69,10 +69,10 @@ MAZE = {  # walls, and the constants in which a maze differs; plan a row of your
     "maze2": dict(WALLS=HULL + [(9, 10, -10, 6.5), (17, 18, 2.5, 18)]),  # Z; the trap: between the walls
     "s_maze": dict(WALLS=[(-7, -6, -13, 13), (45, 46, -13, 13), (-7, 46, -13, -12), (-7, 46, 12, 13),
                           (9, 10, -12, -0.5), (28, 29, 0.5, 12)],
-                   GOAL=(38, 0), HOLD=50, LENGTH=6, PLANNED=2, EPISODE=600),
+                   GOAL=(38, 0), HOLD=50, LENGTH=6, PLANNED=2),
     "obstacles": dict(WALLS=[(-7, -6, -7, 19), (31, 32, -7, 19), (-7, 32, -7, -6), (-7, 32, 18, 19),
                              (7, 9, 2.5, 4.5), (13, 15, 10, 12), (12, 14, 0, 2), (2, 4, 7, 9)],
-                      GOAL=(17, 8), HOLD=50, LENGTH=5, PLANNED=1, EPISODE=250),
+                      GOAL=(17, 8), HOLD=50, PLANNED=1, EPISODE=250),
     "open": dict(WALLS=[]),  # for extras/drive.py
 }
 # App. A.1.4 gives DADS U(-1, 1), as it is trained, and SeCTAR U(-1.5, 1.5); Table 2 swaps the two.
@@ -90,7 +90,7 @@ METHODS = {  # Table 2
 
 # -------- Algorithm 2, Sec. 5; its lines are counted from "for i", each "end" is one
 # case: a Configuration (below), the constants of one run in lower case. policy: what 03 has saved, with
-# actor, decoder, names, relation, and scale, metres a step per trajectory unit.
+# actor, decoder (DADS: its skill dynamics), names, relation, and scale, metres a step per trajectory unit.
 
 def plan_and_execute(case, policy):
     """Algorithm 2 for case.trials robots side by side. Returns their poses (steps + 1, trials, nq), and for
@@ -107,10 +107,11 @@ def plan_and_execute(case, policy):
         horizon = min(case.planned, skills - i)  # a departure: no plan looks beyond the end of the episode
         best = [plan(case, policy, pool, horizon, s0) for s0 in robots.place()]  # lines 2 to 11
         z, paths = map(torch.stack, zip(*best))
-        commands = commands_of(policy, z, case.length)  # lines 12, 17 and 18 for all t: (trials, T, 2)
+        # In all modes the Ant is commanded single steps of the decoder, chained by the f^m: (trials, T, 2)
+        commands = commands_of(policy, z, case.length)  # lines 12, 17 and 18, for all t
         # lines 13 to 16, 19; in closed loop with mean actions
         poses.append(execute(policy, robots, commands, case.hold, closed, deterministic=closed))
-        plans.append((z, paths))  # line 20, s_0 of the next round, is where the robots are now
+        plans.append((z, paths))  # line 20: the robots are at s_0 of the next round
     return np.concatenate(poses), plans
 
 
@@ -122,7 +123,7 @@ def plan(case, policy, pool, horizon, s0):
     picked = torch.randint(len(z), (case.samples, horizon))  # line 3; their distribution: skill_pool
     path = [state]
     for j in range(horizon):  # line 4
-        delta_j = delta[picked[:, j]]  # lines 5 and 6, decoded once, in skill_pool: (N, T, 2)
+        delta_j = delta[picked[:, j]]  # lines 5 and 6: decoded in skill_pool, already as steps; (N, T, 2)
         # Trajectory scaling, Fig 3, in metres. The paper prints s_0 where the planned state must stand
         path.append(state + policy.scale * case.hold * delta_j.cumsum(1))  # line 7
         state = path[-1][:, -1:]  # line 8
@@ -141,13 +142,9 @@ def skill_pool(case, policy):
     if "speed" in policy.names:  # the paper: U(-1.5, 0), for its axis points the other way
         low[policy.names.index("speed")] = 0
     z = low + (high - low) * torch.rand(case.pool, len(low))  # line 3
-    delta = []
-    for part in z.split(8192):
-        if case.mode == "printed":
-            delta.append(policy.decoder(part, case.length)[0])  # one run of T transitions with all of z
-        else:
-            delta.append(commands_of(policy, part, case.length))  # first steps, chained by the f^m
-    return z, torch.cat(delta)
+    if case.mode == "printed":
+        return z, policy.decoder(z, case.length)[0]  # one run of T transitions with all of z
+    return z, commands_of(policy, z, case.length)  # first steps, chained by the f^m
 
 
 def planning_reward(path, case):
@@ -229,14 +226,14 @@ class Configuration:
 
 def configurations_of(method, maze, v):
     """The configurations of a method in a maze; v: its constants, and WALLS: {NAME: value}."""
-    same = {field.name: v.get(field.name.upper()) for field in fields(Configuration)}
-    skills, found = v["EPISODE"] // (v["HOLD"] * v["LENGTH"]), []  # H_E / (H_z T)
-    for mode, reward in product(v["MODES"].split(), v["REWARDS"].split()):
+    same = {field.name: v.get(field.name.upper()) for field in fields(Configuration)}  # the others: below
+    skills, found = v["EPISODE"] // (v["HOLD"] * v["LENGTH"]), {}  # H_E / (H_z T)
+    for mode, reward, seed, samples in product(v["MODES"].split(), v["REWARDS"].split(), v["POLICY_SEEDS"],
+                                               v["SAMPLES"]):
         planned = skills if reward == "sparse" else min(v["PLANNED"], skills)  # App. A.1.4
-        of_both = same | dict(method=method, maze=maze, mode=mode, reward=reward, planned=planned)
-        for seed, samples in product(v["POLICY_SEEDS"], v["SAMPLES"]):
-            found.append(Configuration(**of_both | dict(policy_seed=seed, samples=samples)))
-    return list(dict.fromkeys(found))
+        of_one = dict(method=method, maze=maze, mode=mode, reward=reward, policy_seed=seed, samples=samples)
+        found[Configuration(**same | of_one | dict(planned=planned))] = True  # each once, in this order
+    return list(found)
 
 
 def check(config, given):
@@ -256,7 +253,7 @@ def check(config, given):
     for method, maze in product(words(METHOD, "method", METHODS), words(MAZES, "mazes", MAZE)):
         of, v = f"{method} in {maze}", config.copy()
         for name, value in (MAZE[maze] | METHODS[method]).items():
-            if name not in kinds and name != "WALLS" or name in of_a_run:
+            if name not in [*kinds, "WALLS"] or name in of_a_run:
                 stop(f"{of}: {name} is no constant that a row may set")
             v[name] = value if name == "WALLS" else convert(value, kinds[name], f"{of}: {name}")
         v |= given  # the last of the sources
@@ -290,7 +287,7 @@ def check(config, given):
                 stop(f"{case.title}: this mode is for policies of WEDIS: --modes printed")
             if policy.method == "dads" and case.length > 1:
                 stop(f"{case.title}: DADS predicts one step: --length 1")
-            size = 40 * case.samples * (case.planned * case.length + 1) + 8 * case.pool * (case.length + 100)
+            size = 40 * case.samples * (case.planned * case.length + 1) + 4000 * case.pool * case.length
             size += case.trials * (120 * case.episode + 1e6)
             common.need_memory(size, "--samples, --pool or --trials")
             settings = common.digest(common.made_by(asdict(case)) | dict(sha256=policy.sha256))
@@ -312,7 +309,7 @@ def maze_spec(case):
 
 def collides(path, walls, radius):
     """Which transitions of paths (N, K + 1, 2) touch a wall grown by radius, metres: (N, K) bool. Exact, by
-    separating axes: segment and rectangle are apart if they are along x, along y, or across the segment."""
+    separating axes: segment and rectangle meet if they do along x, along y, and across the segment."""
     parts = path.split(max(1, 50_000 // path.shape[1]))  # in the processor's cache
     if len(parts) > 1:
         return torch.cat([collides(part, walls, radius) for part in parts])
@@ -321,9 +318,9 @@ def collides(path, walls, radius):
     dx, dy = path.diff(dim=1).permute(2, 0, 1).contiguous() / 2  # half of each transition, (N, K)
     x, y = (path[:, :-1] + path[:, 1:]).permute(2, 0, 1).contiguous() / 2  # its middle
     x, y = x - (x0 + x1) / 2, y - (y0 + y1) / 2  # less that of each wall, (walls, N, K)
-    along_x, along_y = x.abs() <= dx.abs() + half_x, y.abs() <= dy.abs() + half_y
-    across = (dx * y - dy * x).abs() <= dx.abs() * half_y + dy.abs() * half_x
-    return (along_x & along_y & across).any(0)
+    meet_x, meet_y = x.abs() <= dx.abs() + half_x, y.abs() <= dy.abs() + half_y
+    meet_across = (dx * y - dy * x).abs() <= dx.abs() * half_y + dy.abs() * half_x
+    return (meet_x & meet_y & meet_across).any(0)
 
 
 def follow_one_skill(case, policy, poses, z, paths):
@@ -385,13 +382,15 @@ def draw_fig06(rows, configurations, examples):
 
 
 def draw_fig07(rows, configurations, examples):
-    """Fig 7: mean final distance against N, with its 95 % interval over policies and trials."""
-    panels = dict.fromkeys((case.maze, case.reward) for case in configurations)
+    """Fig 7: mean final distance against N, with its 95 % interval over policies and trials; dashed: the
+    goal's distance from the origin."""
+    panels = {(case.maze, case.reward): np.hypot(*case.goal) for case in configurations}
     okabe_ito = cycle([BLUE, RED, "#009E73", "#E69F00", "#CC79A7", "#56B4E9"])
     colours = dict(zip(dict.fromkeys(case.method for case in configurations), okabe_ito))
     marks, rng = dict(printed="o-", commands="s--", closed="^:"), np.random.default_rng(0)
     figure, axes = plt.subplots(1, len(panels), figsize=(3.6 * len(panels), 4), sharey=True, squeeze=False)
-    for ax, (maze, reward) in zip(axes[0], panels):
+    for ax, ((maze, reward), distance) in zip(axes[0], panels.items()):
+        ax.axhline(distance, ls="--", color=GREY)
         for method, mode in dict.fromkeys((case.method, case.mode) for case in configurations):
             found, where = [], dict(maze=maze, reward=reward, method=method, mode=mode)
             for samples in sorted({case.samples for case in configurations}):

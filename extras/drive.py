@@ -151,13 +151,14 @@ def drive(config, policy, spec, plan_to_goal, seconds, port):
 
 def main():
     stage = importlib.import_module("04_mpc_maze")
-    vars(stage).update(MAZES="open", REWARDS="dense", MODES="commands", DRAW="", SECONDS=0.0, PORT=8080)
+    # parse_flags finds constants, their types and the help in a module: add to those of 04
+    vars(stage).update(MAZES="open", REWARDS="dense", MODES="commands", TRIALS=1, SECONDS=0.0, PORT=8080)
     stage.__annotations__ |= dict(SECONDS=float, PORT=int)
     stage.__doc__ = __doc__
     runs = stage.check(*common.parse_flags(vars(stage)))
     if len(runs) > 1:
-        common.stop("drive with one of each: "
-                    "--method, --mazes, --modes, --rewards, --policy_seeds and --samples")
+        common.stop("drive with one value of each: --method, --mazes, --modes, --rewards, --policy_seeds, "
+                    "--samples")
     torch.set_num_threads(1)
     case, policy, _ = runs[0]
     planner = partial(stage.plan, case, policy, stage.skill_pool(case, policy), case.planned)

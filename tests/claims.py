@@ -1,7 +1,7 @@
 """The claims of Sec. 6.2.1 and Table 2, from the rows of 04: python tests/claims.py [--out FOLDER]
 
 Reads <OUT>/results/figure7.csv and matched.csv, as made by 04_mpc_maze.py --experiment figure7 and
---experiment matched --planned 99 (sparse plans of WEDIS-S and WEDIS-NTS look equally far already), and writes claims.csv
+--experiment matched --planned 99 --samples 1000 (sparse plans of WEDIS-S and WEDIS-NTS look equally far already), and writes claims.csv
 and table2.csv beside them. `--out .` judges what is shipped; tests/report.py --ship does the same.
 """
 import importlib

@@ -177,8 +177,8 @@ def mazes():
     trials = " or ".join(f"{n} {'policy' if n == 1 else 'policies'} x {trials} trials" for n, trials in shapes)
     return markdown(["maze", "reward", *(NAMES[mode] for mode in MODES)], rows, "The mazes are", "python 04_mpc_maze.py") + [
         "", f"Mean distance to the goal at the end, and share of trials that end within {stage4.EPSILON:g} m of it, with N = {most:,} "
-        f"samples a plan; {trials}. The start is {math.hypot(*stage4.GOAL):.1f} m from the goal; the shortest path around the walls "
-        f"is {SHORTEST_PATH} m long."][:2 * len(rows)]
+        f"samples a plan; {trials}. The start is {math.hypot(*stage4.GOAL):.1f} m from the goal; the shortest path that stays "
+        f"1 m from the walls is {SHORTEST_PATH} m long."][:2 * len(rows)]
 
 
 def scripts():

@@ -94,7 +94,7 @@ def test_a_method_without_axes_is_one_line(folder):
 
 @pytest.mark.parametrize("flags, line", [
     ("--mazes maze1,maze2", "unknown 'maze1,maze2' in --mazes"), ("--policy_seeds 0,0", "http"), ("--port x", "--port is 'x'"),
-    ("--samples 1,2", "drive with one of each"), ("--seconds -1", "--seconds is '-1'")])
+    ("--samples 1,2", "drive with one value of each"), ("--seconds -1", "--seconds is '-1'")])
 def test_what_makes_no_sense_is_one_line(folder, flags, line):
     flags = flags.split()
     if line == "http":  # the same policy twice is one
