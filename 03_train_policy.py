@@ -4,7 +4,7 @@ In: wetvae_<DECODER>_seed<n>.pt of stage 2. The command c of a skill z_single is
 displacement. The reward is the decoder's log-likelihood of the step that the robot makes (Eq. 6).
 Out: runs/policy_<experiment>_seed<n>.pt, Fig 5 (15, 16) and a row of runs/results/policies.csv.
 Takes 12 to 15 minutes on two cores (135 to 112 updates/s). Expect, mean of 3 seeds: tracking error 0.10
-in open loop, 0.03 in closed loop; there, median following error 0.08 m, and 1.3 % of the robots turn over.
+in open loop; in closed loop 0.03, a median following error of 0.08 m, and 1.3 % of the robots turn over.
 """
 import copy
 import math
@@ -25,7 +25,7 @@ SEED: int = 0                 # random seed of the whole chain: data, decoder, p
 OUT: str = "runs"             # folder that everything is written to
 TRAIN: bool = True            # false: only measure and draw what is already trained
 RESUME: bool = False          # true: continue from the last checkpoint
-THREADS: Threads = 2          # CPU threads; 1: updates wait for the robots' step, with the same result
+THREADS: Threads = 2          # 1: updates wait for the robots' step, with the same result; 3 and more: as 2
 
 DECODER: str = "main"         # model of 02 whose decoder is the reward
 ROBOT: str = "ant"            # ant or half_cheetah
@@ -44,14 +44,14 @@ RELABELLED: Share = 0.5       # share of a batch that is relabelled with a fresh
 
 HIDDEN: Count = 256           # width of both hidden layers (the paper: 512; Half-Cheetah 256)
 LEARNING_RATE: Positive = 1e-3  # of Adam (the paper: 0.0003, fixed)
-DECAY_FROM: Share = 0.5       # share of the updates after which it falls, linearly to 0 (the paper: 1)
+DECAY_FROM: Share = 0.5       # share of the updates after which the rate falls, linearly to 0 (the paper: 1)
 ACTOR_EVERY: Count = 2        # updates of the critics for each one of actor, value, target (the paper: 1)
 AVERAGED: Share = 0.002       # rate of the actor's running average, the policy; 0: none (the paper: 0)
 DISCOUNT: Share = 0.99        # gamma of Eq. 1
 SMOOTHING: Share = 0.01       # of the target value network, App. A.1.3
 REWARD_SCALE: float = 0.1     # of Eq. 6 (the paper: 1)
 TEMPERATURE: float = 0.003    # alpha, weight of the entropy (the paper: 0.01, that is 0.001 at our scale)
-FLOOR_START: float = 0.04     # metres, least deviation in the reward; started at 0.01, robots stand still
+FLOOR_START: float = 0.04     # metres, least deviation in the reward; with 0.01 at first robots stand still
 FLOOR_END: float = 0.01       # what it shrinks to until DECAY_FROM, geometrically (the paper: 0)
 
 # Baselines only
@@ -83,7 +83,7 @@ EXPERIMENTS = {  # a row names the constants in which an experiment differs
                      MULTI_RUN=(1, 200), FIGURE="fig05_skills_dads"),
     "ant_sectar": dict(METHOD="sectar", UPDATES=30_000, Z_DIM=8, SKILL_STEPS=50, RECENT=512_000,
                        MODEL_BATCH=128, REWARD_SCALE=1.0, DISCOUNT=0.98, SINGLE_RUN=(50, 1),
-                       MULTI_RUN=(50, 1), FIGURE="fig05_skills_sectar"),  # it stands still anyway
+                       MULTI_RUN=(50, 1), FIGURE="fig05_skills_sectar"),  # more updates do not make it move
 }
 MAY_DIFFER = (  # between a policy, or a checkpoint, and the run that uses it
     "OUT TRAIN RESUME THREADS REPORTS UPDATES Z_RANGE SINGLE_RUN MULTI_RUN TRAVERSAL NOISY STARTS FIGURE "
@@ -96,7 +96,7 @@ def reward(c, log_var, displacement, floor):
     """REWARD_SCALE * log p_theta(s_t+1 | s_t, z), Eq. 6, (B,), less its normaliser, which no action changes.
     c, the command, and log_var (B, 2 or 1): the decoder's mean and log-variance, trajectory units;
     displacement (B, 2 or 1), s_t+1 - s_t of Eq. 6, whose s is the place alone, and floor: metres."""
-    variance = STEP_SCALE ** 2 * log_var.exp()  # square metres (the paper: 1/20 instead of the square)
+    variance = STEP_SCALE ** 2 * log_var.exp()  # square metres (the paper: 1/20 in place of STEP_SCALE ** 2)
     variance = variance.clamp(min=floor ** 2)  # without a floor at first, robots learn to stand still
     return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * c) ** 2 / variance).sum(1)
 
@@ -104,13 +104,12 @@ def reward(c, log_var, displacement, floor):
 def train_wedis(decoder, names):
     """Alg. 1, the second loop: a policy that follows single steps of the decoder, which `load` has frozen.
     Returns the policy. Shapes beside the lines: the Ant, n = ROBOTS, B = UPDATES_PER_STEP * BATCH = 2048."""
-    x_dim = decoder.x_dim
     m1 = sum(name in SINGLE for name in names)  # M_1; the axes of z_single come first
     m2 = len(names) - m1  # M_2
     robots, rng, submit = start_robots()
     s_dim, a_dim = robots.observe().shape[1], robots.ctrl.shape[1]
-    sac = Sac(s_dim, x_dim, a_dim)  # Alg. 1: initialize psi, psi bar, psi hat
-    replay = Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=x_dim, z_single=m1)
+    sac = Sac(s_dim, decoder.x_dim, a_dim)  # Alg. 1: initialize psi, psi bar, psi hat
+    replay = Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=decoder.x_dim, z_single=m1)
     # With --resume true, Log puts back the robots, replay and sac of the last checkpoint
     log = Log(make_policy(sac, decoder, names, STEP_SCALE), robots, rng, replay, sac)
     z_single = replay.latest(ROBOTS).z_single  # zeros at first, until a robot's skill is over
@@ -120,7 +119,7 @@ def train_wedis(decoder, names):
         over = robots.age() % SKILL_STEPS == 0                                       # (n, 1)
         z_single = torch.where(over, torch.randn(ROBOTS, m1), z_single)              # (n, 2)
         z = torch.cat([z_single, torch.zeros(ROBOTS, m2)], 1)                        # (n, 3)
-        c = decoder(z, 1)[0][:, 0]  # the command: one step from rest, trajectory units; (n, 2)
+        c = decoder(z, 1)[0][:, 0]  # the command: the decoder's first displacement for it; (n, 2)
 
         # Alg. 1: execute actions a ~ pi(a | s, z_single), here pi(a | s, c); a second core steps the robots
         s = robots.observe()                                                         # (n, 27)
@@ -146,8 +145,7 @@ def train_wedis(decoder, names):
             on_floor = (STEP_SCALE ** 2 * log_var.exp() < floor ** 2).float().mean()
 
             # Alg. 1: optimize psi, psi bar, psi hat with the SAC, BATCH steps at a time
-            losses = sac.learn(batch, c, c, r)  # the same command after the step, as if no skill ended
-            log.numbers = losses | dict(reward=r.mean(), on_floor=on_floor)
+            log.numbers = sac.learn(batch, c, r) | dict(reward=r.mean(), on_floor=on_floor)
 
         # Alg. 1: collect the samples in the replay buffer R (after the updates, which ran meanwhile)
         displacement, unstable = physics.result()                                    # (n, 2) metres, (n,)
@@ -160,9 +158,8 @@ def train_wedis(decoder, names):
 # -------- SAC (Haarnoja et al. 2017), App. A.1.3
 
 class Sac(nn.Module):
-    """Actor psi, twin critics (psi bar; Alg. 1 names one), value (psi hat) and its target network, with a
-    fixed temperature.
-    average: the policy, a running average of the actor's weights."""
+    """Actor psi, twin critics (psi bar; Alg. 1 names one), value (psi hat), its target network; the
+    temperature is fixed. average: the policy, a running average of the actor's weights."""
 
     def __init__(self, s_dim, c_dim, a_dim):
         super().__init__()
@@ -183,22 +180,21 @@ class Sac(nn.Module):
         self.actor.s_std.copy_(x.std(0, correction=0).clamp(min=1e-3))
         self.average.load_state_dict(self.actor.state_dict())
 
-    def learn(self, batch, c, c2, r):
-        """Updates with the steps of batch, BATCH at a time. c, c2 (B, c_dim): commands before and after the
-        step; r (B,): rewards. Returns the last losses."""
+    def learn(self, batch, c, r):
+        """Updates with the steps of batch, BATCH at a time. c (B, c_dim): their commands, also after the
+        step, as if no skill ended; r (B,): rewards. Returns the last losses."""
         left = (1 - self.updates / UPDATES) / max(1 - DECAY_FROM, 1e-9)
         for group in self.critic_adam.param_groups + self.actor_adam.param_groups:
             group["lr"] = LEARNING_RATE * min(1, left)
-        x, x2 = self.actor.inputs(batch.s, c), self.actor.inputs(batch.s2, c2)
+        x, x2 = self.actor.inputs(batch.s, c), self.actor.inputs(batch.s2, c)
         for part in zip(x.split(BATCH), batch.a.split(BATCH), x2.split(BATCH), r.split(BATCH)):
             self.update(*part)
         return self.losses
 
     def update(self, x, a, x2, r):
         """One update; no step is terminal. x, x2 (BATCH, 26 + 2): Actor.inputs before and after the step; a
-        (BATCH, 8); r (BATCH,)."""
-        with torch.no_grad():
-            q_target = r + DISCOUNT * self.target(x2).squeeze(1)
+        (BATCH, 8); r (BATCH,). Actor and value share no parameter: one backward serves both."""
+        q_target = r + DISCOUNT * self.target(x2).squeeze(1)
         q1, q2 = (critic(torch.cat([x, a], 1)).squeeze(1) for critic in self.critics)
         q_loss = 0.5 * ((q1 - q_target) ** 2 + (q2 - q_target) ** 2).mean()
         self.critic_adam.zero_grad()
@@ -209,38 +205,33 @@ class Sac(nn.Module):
         if self.updates % ACTOR_EVERY:
             return
         a_new, log_prob = self.actor(x)
-        self.critics.requires_grad_(False)  # while q1, q2 are recorded: backward skips their weights
         q1, q2 = (critic(torch.cat([x, a_new], 1)).squeeze(1) for critic in self.critics)
         q_new = torch.minimum(q1, q2)
-        self.critics.requires_grad_(True)
-        actor_loss = (TEMPERATURE * log_prob - q_new).mean()  # for Eq. 6's entropy: of actions
+        actor_loss = (TEMPERATURE * log_prob - q_new).mean()  # entropy of actions, Eq. 6: of steps
         v_loss = 0.5 * ((self.value(x).squeeze(1) - (q_new - TEMPERATURE * log_prob).detach()) ** 2).mean()
         self.actor_adam.zero_grad()
-        (actor_loss + v_loss).backward()  # one backward for both: they share no parameter
+        (actor_loss + v_loss).backward(inputs=[*self.actor.parameters(), *self.value.parameters()])
         self.actor_adam.step()
         with torch.no_grad():
             torch._foreach_lerp_([*self.target.parameters()], [*self.value.parameters()], SMOOTHING)
-            rate = AVERAGED or 1.0  # 0 switches the average off
-            torch._foreach_lerp_([*self.average.net.parameters()], [*self.actor.net.parameters()], rate)
+            torch._foreach_lerp_([*self.average.parameters()], [*self.actor.parameters()], AVERAGED or 1.0)
         self.losses |= dict(actor_loss=actor_loss.detach())
 
 
-# -------- main
-
 def main():
     config, _ = common.parse_flags(globals())
-    torch.set_num_threads(1)  # for the networks; the other of THREADS steps the robots
+    torch.set_num_threads(1)  # for the networks; a second one steps the robots
     source = common.load(OUT, "wetvae", DECODER, SEED)
     check(source)
     if TRAIN:
         torch.manual_seed(SEED)
         train = dict(wedis=train_wedis, dads=train_dads, sectar=train_sectar)[METHOD]
         policy = train(source["decoder"], source["names"])
-        policy.relation = source["relation"]  # Alg. 1 finds them here, by hand; 02 has, from the decoder
+        policy.relation = source["relation"]  # Alg. 1 finds them here, by hand; 02 found them in the decoder
         common.save(OUT, "policy", EXPERIMENT, SEED, config, **vars(policy))  # before it is measured
     policy = SimpleNamespace(**common.load(OUT, "policy", EXPERIMENT, SEED, **made_with()))
     same_decoder(policy, source["decoder"])
-    measure(policy, source["ranges"])
+    measure(policy, source["ranges"], config)
     follow_one_skill(policy, source)
     draw_skills(policy)
 
@@ -255,16 +246,14 @@ def check(source):
         stop("--method is wedis, dads or sectar; --robot is ant or half_cheetah")
     if ROBOT != "ant" and (BASE_FRAME or METHOD != "wedis"):
         stop(f"the {ROBOT} runs on a rail: --base_frame false; DADS and SeCTAR need --robot ant")
-    if METHOD == "dads" and BASE_FRAME and Z_DIM != 2:
-        stop("in the base frame, in which z is turned, DADS needs --z_dim 2")
-    known = names[0] == "speed" and all(name in SINGLE or MULTI.get(name) in names for name in names)
-    if not known or decoder.x_dim != 1 + (ROBOT == "ant"):
+    usable = names[0] == "speed" and all(name in SINGLE or MULTI.get(name) in names for name in names)
+    if not usable or decoder.x_dim != 1 + (ROBOT == "ant"):
         stop(f"the decoder {DECODER} has axes {' '.join(names)} and predicts {decoder.x_dim} coordinates: "
              f"the {ROBOT} needs another --decoder")
     if DISCOUNT == 1:
         stop("--discount must be below 1: no step is terminal, so values would have no bound")
-    if METHOD == "dads" and SINGLE_RUN[0] * MULTI_RUN[0] > 1:
-        stop("DADS predicts one step: T, the first of --single_run and --multi_run, must be 1")
+    if METHOD == "dads" and (Z_DIM != 2 or SINGLE_RUN[0] * MULTI_RUN[0] > 1):
+        stop("DADS: --z_dim must be 2, and T, the first of --single_run and of --multi_run, must be 1")
     common.need_memory(300 * max(REPLAY, 2 * ROBOTS * SKILL_STEPS) + 50_000 * ROBOTS, "--replay or --robots")
     common.need_memory(400 * HIDDEN ** 2 + 1000 * UPDATES_PER_STEP * BATCH, "--hidden or --batch")
     common.need_memory(100_000 * (STARTS + NOISY * TRAVERSAL), "--starts, --noisy or --traversal")
@@ -313,7 +302,7 @@ class Replay:
 
     def __init__(self, **widths):
         self.widths, self.added = widths, 0
-        block = ROBOTS * SKILL_STEPS  # a skill of all robots: whole ones, and at least two
+        block = ROBOTS * SKILL_STEPS  # a skill of all robots; the table holds whole ones, at least two
         self.table = torch.zeros(max(2, REPLAY // block) * block, sum(widths.values()))
 
     def add(self, unstable, **fields):
@@ -333,17 +322,9 @@ class Replay:
         n = min(n, max(self.added, ROBOTS), len(self.table))
         return self.read((self.added - n + torch.arange(n)) % len(self.table))
 
-    def trajectories(self, n, recent):
-        """n random stretches of SKILL_STEPS steps of one robot, of the `recent` latest steps of all robots:
-        fields (n, SKILL_STEPS, width)."""
-        newest = max(ROBOTS * SKILL_STEPS, min(self.added, recent, len(self.table)))  # one of each robot
-        last = self.added - 1 - torch.randint(newest - ROBOTS * (SKILL_STEPS - 1), (n,))
-        return self.read((last[:, None] - ROBOTS * torch.arange(SKILL_STEPS).flip(0)) % len(self.table))
-
-    def sample(self, n, recent=None):
-        """n random steps, of all or of the `recent` latest ones."""
-        filled = min(self.added, len(self.table))
-        back = torch.randint(min(recent or filled, filled), (n,))
+    def sample(self, n):
+        """n random steps."""
+        back = torch.randint(min(self.added, len(self.table)), (n,))
         return self.read((self.added - 1 - back) % len(self.table))
 
 
@@ -358,7 +339,17 @@ class Log:
         if RESUME and not path.exists():
             print("there is no checkpoint yet")
         elif RESUME:
-            self.resume(common.load(OUT, "policy-checkpoint", EXPERIMENT, SEED, **made_with()))
+            saved = common.load(OUT, "policy-checkpoint", EXPERIMENT, SEED, **made_with())
+            same_decoder(SimpleNamespace(**saved), policy.decoder)
+            for part, state in zip(self.parts, saved["parts"]):
+                part.load_state_dict(state)
+            for name in ("curve", "seconds", "scale", "updates", "env_steps"):
+                setattr(policy, name, saved[name])
+            sac.updates, replay.added = policy.updates, policy.env_steps
+            replay.table[:len(saved["table"])] = saved["table"]
+            robots.batch.state[:] = saved["robots"].numpy()
+            torch.set_rng_state(saved["torch_rng"])
+            rng.bit_generator.state = saved["rng"]
         self.clock = time.time()
 
     def step(self):
@@ -378,30 +369,14 @@ class Log:
             row["tracking_error_closed"] = tracking(policy, True)
         policy.curve.append(row | {name: float(value) for name, value in self.numbers.items()})
         left = policy.seconds / 60 * (UPDATES / policy.updates - 1)
-        words = [f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
-                 for name, value in policy.curve[-1].items()]
-        speed = policy.updates / policy.seconds
-        print(*words, f"{speed:.0f} updates/s", f"{left:.1f} min left", sep="  ", flush=True)
-        common.save(OUT, "policy-checkpoint", EXPERIMENT, SEED, made_with(), decoder=policy.decoder,
-                    robots=torch.from_numpy(self.robots.batch.state.copy()), added=self.replay.added,
-                    table=self.replay.table[:self.replay.added].clone(), curve=policy.curve,
-                    scale=policy.scale, updates=policy.updates, seconds=policy.seconds,
-                    torch_rng=torch.get_rng_state(),
-                    rng=self.rng.bit_generator.state, parts=[part.state_dict() for part in self.parts])
+        words = [f"{name} {round(value, 3)}" for name, value in policy.curve[-1].items()]
+        words += [f"{policy.updates / policy.seconds:.0f} updates/s", f"{left:.1f} min left"]
+        print(*words, sep="  ", flush=True)
+        common.save(OUT, "policy-checkpoint", EXPERIMENT, SEED, made_with(), **vars(policy),
+                    robots=torch.from_numpy(self.robots.batch.state.copy()), torch_rng=torch.get_rng_state(),
+                    table=self.replay.table[:self.replay.added].clone(), rng=self.rng.bit_generator.state,
+                    parts=[part.state_dict() for part in self.parts])
         self.clock = time.time()
-
-    def resume(self, saved):
-        same_decoder(SimpleNamespace(**saved), self.policy.decoder)
-        for part, state in zip(self.parts, saved["parts"]):
-            part.load_state_dict(state)
-        self.replay.table[:len(saved["table"])] = saved["table"]
-        self.replay.added = self.policy.env_steps = saved["added"]
-        self.sac.updates = self.policy.updates = saved["updates"]
-        self.robots.batch.state[:] = saved["robots"].numpy()
-        for name in ("curve", "seconds", "scale"):
-            setattr(self.policy, name, saved[name])
-        torch.set_rng_state(saved["torch_rng"])
-        self.rng.bit_generator.state = saved["rng"]
 
 
 # -------- baselines: not needed for WEDIS. Loops as above, with models that are learnt at the same time
@@ -430,11 +405,11 @@ def train_dads(_decoder, _names):
         if replay.added >= WARM_UP:
             if sac.updates == 0:
                 sac.normalise(replay.read(slice(0, replay.added)).s)
-            recent = replay.latest(RECENT).displacement
-            log.policy.scale = recent.square().mean().sqrt().clamp(min=1e-4).item()  # the unit, metres a step
+            recent = replay.latest(RECENT)
+            log.policy.scale = recent.displacement.square().mean().sqrt().clamp(min=1e-4).item()
             for _ in range(MODEL_UPDATES):
-                batch = replay.sample(MODEL_BATCH, RECENT)  # each step with the skill that made it
-                model_loss = -log_q(batch.displacement, batch.z).mean()
+                rows = -1 - torch.randint(len(recent.z), (MODEL_BATCH,))  # with the skills that made them
+                model_loss = -log_q(recent.displacement[rows], recent.z[rows]).mean()
                 adam.zero_grad()
                 model_loss.backward()
                 adam.step()
@@ -446,8 +421,7 @@ def train_dads(_decoder, _names):
                 others = log_q(batch.displacement[:, None], torch.rand(PRIOR_SAMPLES, Z_DIM) * 2 - 1)
                 ratios = (others - own[:, None]).clamp(-50, 50).exp().sum(1)
                 r = REWARD_SCALE * (math.log(PRIOR_SAMPLES + 1) - (1 + ratios).log())
-            losses = sac.learn(batch, batch.z, batch.z, r)
-            log.numbers = losses | dict(reward=r.mean(), model_loss=model_loss.detach())
+            log.numbers = sac.learn(batch, batch.z, r) | dict(reward=r.mean(), model_loss=model_loss.detach())
         displacement, unstable = physics.result()
         replay.add(unstable, s=s, a=a, s2=robots.observe(), displacement=displacement, z=z)
         robots.reset(np.flatnonzero((robots.age()[:, 0].numpy() >= EPISODE) | unstable), rng)
@@ -456,9 +430,9 @@ def train_dads(_decoder, _names):
 
 
 def train_sectar(_decoder, _names):
-    """Co-Reyes et al. 2018, in short: a VAE learns from the policy's own trajectories, T = SKILL_STEPS steps
-    of a robot (theirs: an explorer's, whose actions it clones), and the policy is rewarded for making the
-    steps that the decoder predicts for z ~ N(0, I). Not reproduced: its skills are not followed."""
+    """Co-Reyes et al. 2018, in short: a VAE learns from windows of T = SKILL_STEPS steps of a robot, that may
+    span two skills (theirs: an explorer's trajectories, whose actions it clones), and the policy is rewarded
+    for steps that the decoder predicts for z ~ N(0, I). Not reproduced: its skills are not followed."""
     robots, rng, submit = start_robots()
     s_dim, a_dim = robots.observe().shape[1], robots.ctrl.shape[1]
     sac, replay = Sac(s_dim, 2, a_dim), Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=2, c=2, z=Z_DIM)
@@ -470,15 +444,17 @@ def train_sectar(_decoder, _names):
     while sac.updates < UPDATES:
         t = robots.age() % SKILL_STEPS
         z = torch.where(t == 0, torch.randn(ROBOTS, Z_DIM), z)
-        with torch.no_grad():
-            c = vae["decoder"](z, SKILL_STEPS)[0][torch.arange(ROBOTS), t[:, 0].long()]
+        c = commands_of(log.policy, z, SKILL_STEPS)[torch.arange(ROBOTS), t[:, 0].long()]
         s = robots.observe()
         a = sac.actor.act(s, c) if replay.added >= WARM_UP else torch.rand(ROBOTS, a_dim) * 2 - 1
         physics = submit(a)
         if replay.added >= max(WARM_UP, ROBOTS * SKILL_STEPS):
             if sac.updates == 0:
                 sac.normalise(replay.read(slice(0, replay.added)).s)
-            x = replay.trajectories(MODEL_BATCH, RECENT).displacement / STEP_SCALE
+            newest = max(ROBOTS * SKILL_STEPS, min(replay.added, RECENT, len(replay.table)))
+            last = replay.added - 1 - torch.randint(newest - ROBOTS * (SKILL_STEPS - 1), (MODEL_BATCH,))
+            rows = last[:, None] - ROBOTS * torch.arange(SKILL_STEPS).flip(0)  # of one robot each
+            x = replay.read(rows % len(replay.table)).displacement / STEP_SCALE
             mean, log_var = vae["encoder"](x.flatten(1)).chunk(2, 1)  # theirs: a bidirectional LSTM
             kl = 0.5 * (mean ** 2 + log_var.exp() - 1 - log_var).sum(1)
             sampled = mean + (0.5 * log_var).exp() * torch.randn_like(mean)
@@ -491,8 +467,7 @@ def train_sectar(_decoder, _names):
             adam.step()
             batch = replay.sample(UPDATES_PER_STEP * BATCH)
             r = -REWARD_SCALE * (batch.displacement / STEP_SCALE - batch.c).norm(dim=1)
-            losses = sac.learn(batch, batch.c, batch.c, r)
-            log.numbers = losses | dict(reward=r.mean(), model_loss=model_loss.detach())
+            log.numbers = sac.learn(batch, batch.c, r) | dict(reward=r.mean(), model_loss=model_loss.detach())
         displacement, unstable = physics.result()
         replay.add(unstable, s=s, a=a, s2=robots.observe(), displacement=displacement, c=c, z=z)
         robots.reset(np.flatnonzero((robots.age()[:, 0].numpy() >= EPISODE) | unstable), rng)
@@ -502,57 +477,40 @@ def train_sectar(_decoder, _names):
 
 # -------- measuring and drawing
 
-def upside_down(poses):
-    """Which robots have turned over, for poses (.., nq) -> (..) bool: the torso's z axis points down."""
-    if ROBOT != "ant":
-        return np.cos(poses[..., 2]) < 0
-    return (poses[..., 4:6] ** 2).sum(-1) > 0.5  # of its quaternion: 1 - 2 (x^2 + y^2) < 0
-
-
 def traversal(policy, axis, values):
     """Skills with one axis at values, the others at 0 (on a rail the speed at -1: 0 cannot accelerate)."""
-    z = torch.zeros(len(values), len(policy.names) or Z_DIM)
-    if policy.decoder.x_dim == 1:
-        z[:, 0] = -1
+    z = torch.zeros(len(values), len(policy.decoder.axes))
+    z[:, 0] = -1 if policy.decoder.x_dim == 1 else 0
     z[:, axis] = torch.as_tensor(values, dtype=torch.float32)
     return z
 
 
-def grid(policy):
-    """Skills of the tracking error, z_multi = 0: 5 speeds x 5 directions (rail: 8 speeds); SeCTAR: 25 draws
-    from the prior."""
-    if METHOD == "sectar":
-        return torch.randn(25, Z_DIM, generator=torch.Generator().manual_seed(0))
-    z = torch.linspace(-Z_RANGE, Z_RANGE, 8)[:, None]
-    if policy.decoder.x_dim == 2:
-        values = torch.linspace(-Z_RANGE, Z_RANGE, 5)
-        z = torch.cartesian_prod(values, values)
-    return nn.functional.pad(z, (0, (len(policy.names) or Z_DIM) - z.shape[1]))
-
-
-def roll_out(policy, z, run, closed, noise=None, run_in=0):
+def roll_out(policy, z, run, closed, rng=None, run_in=0):
     """Execute skills z (n, M) with mean actions, run = (T, H_z): places (n, T * H_z + 1, 2 or 1) in metres.
     From rest, or with noise (a seed) from noisy starts; recorded after run_in steps."""
     robots = common.Robots(common.robot_spec(ROBOT), len(z), THREADS)
-    if noise is not None:
-        robots.reset(np.arange(len(z)), np.random.default_rng(noise))
+    robots.reset(np.arange(len(z)), rng)
     commands = commands_of(policy, z, run[0])
     execute(policy, robots, commands[:, :1], run_in, closed, True)
-    start = robots.qpos[None].copy()
-    poses = np.concatenate([start, execute(policy, robots, commands, run[1], closed, True)])
-    return poses[..., :robots.places].swapaxes(0, 1).astype(np.float32)
+    poses = [robots.qpos[None].copy(), execute(policy, robots, commands, run[1], closed, True)]
+    return np.concatenate(poses)[..., :robots.places].swapaxes(0, 1).astype(np.float32)
 
 
 def predicted_path(policy, z, run):
     """The decoder's free run of T transitions, each H_z steps long: places (n, T + 1, 2 or 1) in metres."""
-    with torch.no_grad():
-        path = run[1] * policy.scale * policy.decoder(z, run[0])[0].cumsum(1)
-    return nn.functional.pad(path, (0, 0, 1, 0)).numpy()
+    path = run[1] * policy.scale * policy.decoder(z, run[0])[0].cumsum(1)
+    return nn.functional.pad(path, (0, 0, 1, 0)).detach().numpy()
 
 
 def tracking(policy, closed):
-    """Tracking error: RMS(executed end - predicted end) / RMS(predicted end) over the grid, from rest."""
-    z = grid(policy)
+    """Tracking error, from rest: RMS(executed end - predicted end) / RMS(predicted end), over a grid of
+    z_single (DADS: z), 5 x 5 or on a rail 8, with z_multi = 0; SeCTAR: over 25 draws from the prior."""
+    x_dim = policy.decoder.x_dim
+    values = torch.linspace(-Z_RANGE, Z_RANGE, 5 if x_dim == 2 else 8)
+    z = torch.cartesian_prod(*[values] * x_dim).view(-1, x_dim)
+    z = nn.functional.pad(z, (0, len(policy.decoder.axes) - x_dim))
+    if METHOD == "sectar":
+        z = torch.randn(25, Z_DIM, generator=torch.Generator().manual_seed(0))
     executed = roll_out(policy, z, SINGLE_RUN, closed)[:, -1]
     predicted = predicted_path(policy, z, SINGLE_RUN)[:, -1]
     return math.sqrt(((executed - predicted) ** 2).sum() / max((predicted ** 2).sum(), 1e-12))
@@ -568,21 +526,21 @@ def following(policy, closed):
     robots.reset(np.arange(STARTS), rng)
     fallen, away, away_free, speeds = np.zeros(STARTS, bool), [], [], []
     for _ in range(3 if METHOD == "wedis" else 1):
-        z = torch.from_numpy(rng.uniform(-Z_RANGE, Z_RANGE, (STARTS, len(policy.names) or Z_DIM))).float()
+        z = torch.from_numpy(rng.uniform(-Z_RANGE, Z_RANGE, (STARTS, len(policy.decoder.axes)))).float()
         if "direction" in policy.names:
             z[:, 0].abs_()  # no slow skills, App. A.1.4; on a rail the sign of the speed is the direction
         commands, start = commands_of(policy, z, length), robots.place().numpy()
         free = predicted_path(policy, z, MULTI_RUN)[:, -1]
         asked = hold * policy.scale * commands.sum(1).numpy() if METHOD == "wedis" else free
         poses = execute(policy, robots, commands, hold, closed, True)
-        fallen |= upside_down(poses).any(0)
+        up = 1 - 2 * (poses[..., 4:6] ** 2).sum(-1) if ROBOT == "ant" else np.cos(poses[..., 2])
+        fallen |= (up < 0).any(0)  # up: the vertical part of the torso's z axis
         places = np.concatenate([start[None], poses[hold - 1::hold, :, :robots.places]])
         away.append(np.linalg.norm(places[-1] - start - asked, axis=1))
         away_free.append(np.linalg.norm(places[-1] - start - free, axis=1))
         speeds.append(np.linalg.norm(np.diff(places, axis=0), axis=2) / hold)
-    return dict(follow_median_m=float(np.median(away)), follow_p90_m=float(np.quantile(away, 0.9)),
-                follow_decoder_m=float(np.median(away_free)), fall_rate=float(fallen.mean()),
-                speed_m_per_step=float(np.mean(speeds)))
+    return dict(follow_median_m=np.median(away), follow_p90_m=np.quantile(away, 0.9), fall_rate=fallen.mean(),
+                follow_decoder_m=np.median(away_free), speed_m_per_step=np.mean(speeds))
 
 
 def executed_cross_talk(policy, ranges, closed):
@@ -590,28 +548,25 @@ def executed_cross_talk(policy, ranges, closed):
     values, curves, (length, hold) = np.linspace(-Z_RANGE, Z_RANGE, TRAVERSAL), [], MULTI_RUN
     for axis in range(len(policy.names)):
         z = traversal(policy, axis, values).repeat(NOISY, 1)
-        places = roll_out(policy, z, MULTI_RUN, closed, noise=SEED + 1, run_in=hold)[:, ::hold]
+        places = roll_out(policy, z, MULTI_RUN, closed, np.random.default_rng(SEED + 1), hold)[:, ::hold]
         steps = np.diff(places, axis=1).reshape(NOISY, TRAVERSAL, length, -1).mean(0)
         curves.append(factors_of(steps / (hold * policy.scale), list(ranges)))
     return common.cross_talk(curves, ranges)
 
 
-def measure(policy, ranges):
+def measure(policy, ranges, config):
     """Print and write a row of results/policies.csv. tracking_error, .._open: open loop; others: closed."""
-    made = common.made_by({name: globals()[name] for name in common.types_of(globals())})
     row = dict(experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy.updates,
                env_steps=policy.env_steps, threads=policy.config["THREADS"],
-               train_minutes=policy.seconds / 60, tracking_error=tracking(policy, False))
-    if METHOD == "wedis":
-        row["tracking_error_closed"] = tracking(policy, True)
+               train_minutes=policy.seconds / 60)
     for closed, end in ((False, "_open"), (True, ""))[:1 + (METHOD == "wedis")]:
+        row["tracking_error" + "_closed" * closed] = tracking(policy, closed)
         row |= {name + end: value for name, value in following(policy, closed).items()}
-        if METHOD == "wedis":
-            _, purity = executed_cross_talk(policy, ranges, closed)
-            row |= {f"purity_{name}{end}": value for name, value in zip(policy.names, purity.tolist())}
+        purity = executed_cross_talk(policy, ranges, closed)[1] if policy.names else ()
+        row |= {f"purity_{name}{end}": value for name, value in zip(policy.names, purity)}
     for name, value in row.items():
         print(f"{name:24} {value if isinstance(value, str) else round(value, 3)}")
-    made = {name: value for name, value in made.items() if name not in ("OUT", "FIGURE", "TRAIN", "RESUME")}
+    made = {k: v for k, v in common.made_by(config).items() if k not in ("OUT", "FIGURE", "TRAIN", "RESUME")}
     row["settings"] = common.digest(made | dict(policy=policy.sha256))
     common.update_csv(Path(OUT) / "results" / "policies.csv", [row], ("experiment", "seed", "settings"))
 
@@ -621,8 +576,7 @@ def follow_one_skill(policy, source):
     if METHOD != "wedis" or not source.get("example"):
         return
     z = torch.tensor([source["example"]]) * torch.tensor([float(name in SINGLE) for name in policy.names])
-    with torch.no_grad():
-        mean, log_var = (out[:, 0] for out in policy.decoder(z, 1))
+    mean, log_var = (out[:, 0] for out in policy.decoder(z, 1))
     places = roll_out(policy, z, (1, 41), True)[0]
     step = torch.from_numpy(places[-1:] - places[-2:-1])
     (x, y), (dx, dy) = (policy.scale * mean[0]).tolist(), step[0].tolist()
@@ -649,18 +603,16 @@ def draw_skills(policy):
         for ax, path in zip(axes[:, i], paths):
             if rail:
                 path = np.dstack([path[..., 0], values[:, None] + 0 * path[..., 0]])
-            marks = path[:, ::1 if path.shape[1] == run[0] + 1 else run[1]]  # the ends of the transitions
-            for line, dots, value, colour in zip(path, marks, values, colours):
-                ax.plot(*line.T, color=colour, lw=1.3, label=f"{value:g}")
-                ax.plot(*dots.T, "o", ms=3 if len(dots) < 10 else 0, color=colour)
+            every = (path.shape[1] - 1) // run[0] if run[0] < 9 else []  # dots: the ends of few transitions
+            for line, value, colour in zip(path, values, colours):
+                ax.plot(*line.T, "o-", color=colour, lw=1.3, ms=3, markevery=every, label=f"{value:g}")
         for ax in axes[:, i]:  # one scale for the column; speeds lie on one line: their y is enlarged
             ax.axis("auto" if rail or name == "speed" else "square")
         axes[0, i].set_title(f"$z_{{{name}}}$, $T$ = {run[0]}, $H_z$ = {run[1]}")
         axes[-1, i].set_xlabel("x (m)")
     for ax, text in zip(axes[:, 0], rows):
         ax.set_ylabel(f"{text}\n{'latent' if rail else 'y (m)'}")
-    handles = axes[0, 0].get_legend_handles_labels()
-    figure.legend(*handles, title="latent", loc="outside right upper")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), title="latent", loc="outside right upper")
     common.save_figure(figure, OUT, FIGURE or f"skills_{EXPERIMENT}")
 
 

@@ -105,7 +105,7 @@ def inside(monkeypatch, capsys):
 
 
 def one_pass(stage, monkeypatch, train, fill=lambda replay: None, prepare=lambda log: None, passes=1):
-    """`passes` steps of a training loop of stage 3 without SAC: what the last one hands to Sac.learn (batch, c, c2, r),
+    """`passes` steps of a training loop of stage 3 without SAC: what the last one hands to Sac.learn (batch, c, r),
     what was stored before it, the state of torch's random numbers where the first one began to learn, and its Log.
     fill(replay) stores steps, prepare(log) changes what was just made."""
     done = SimpleNamespace(batch=None, left=passes)
@@ -126,8 +126,8 @@ def one_pass(stage, monkeypatch, train, fill=lambda replay: None, prepare=lambda
             if not done.left:
                 self.sac.updates = stage.UPDATES
 
-    def learn(sac, batch, c, c2, r):
-        done.batch, done.c, done.c2, done.r = batch, c, c2, r
+    def learn(sac, batch, c, r):
+        done.batch, done.c, done.r = batch, c, r
         return {}
 
     def normalise(sac, s):

@@ -104,7 +104,7 @@ def test_killed_three_times_it_ends_with_the_same_bits(fork, out):
         seen = set()
         fork.wait_for(lambda seen=seen: seen.add(file.exists() and file.stat().st_mtime_ns) or len(seen) > 4)
         assert fork.end(signal.SIGKILL).returncode == -signal.SIGKILL
-        reached.append(common.load(out, "policy-checkpoint", "ant_semi", 0)["added"])
+        reached.append(common.load(out, "policy-checkpoint", "ant_semi", 0)["env_steps"])
     assert reached == sorted(set(reached)) and reached[-1] < 8 * 30, "finished before the last kill"
     assert same(whole, train_to_the_end())
 
