@@ -1,8 +1,8 @@
 """What two or more stages share: decoder, relation functions, weak labels, robots, actor, execution.
 
 Units: metres, radians, environment steps of 0.05 s. Decoder displacements are in trajectory units: 1 is the
-highest speed of the data. `scale` makes them metres a step (Ant 1/10, Half-Cheetah 1/5; A.1.3). The lines of
-Alg. 2 are counted from "for i"; each "end" is one.
+highest speed of the data. `scale` makes them metres a step (Ant 1/10, Half-Cheetah 1/5, A.1.3; DADS: learnt).
+The lines of Alg. 2 are counted from "for i"; each "end" is one.
 """
 import argparse
 import contextlib
@@ -128,11 +128,11 @@ def commands_of(policy, z, steps):
         return z[:, None].expand(-1, steps, -1)
     if policy.method == "sectar":
         return policy.decoder(z, steps)[0]
-    is_single = torch.tensor([float(name in SINGLE) for name in policy.names])
+    is_single = torch.tensor([name in SINGLE for name in policy.names])
     singles = []
     for _ in range(steps):
-        singles.append(z * is_single)  # (z_single, 0); at first Alg. 2, line 12
-        z = next_skill(z, policy.names, policy.relation)  # Alg. 2, lines 17 and 18
+        singles.append(z * is_single)  # (z_single, 0): Alg. 2, line 12, in later transitions line 18
+        z = next_skill(z, policy.names, policy.relation)  # Alg. 2, line 17
     mean, _ = policy.decoder(torch.cat(singles), 1)  # (steps * B, 1, c_dim)
     return mean.view(steps, len(z), -1).transpose(0, 1)
 
@@ -157,7 +157,7 @@ class Robots:
         self.reset(np.arange(n))
 
     def reset(self, ids, rng=None):
-        """Robots ids at the origin at rest; with rng, plus U(-0.1, 0.1) on qpos and N(0, 0.1) on qvel."""
+        """Robots ids at the origin at rest; with rng, plus U(-0.1, 0.1) on qpos and N(0, 0.1^2) on qvel."""
         self.batch.reset(ids, keyframe=0, stage=mujoco.mjtStage.mjSTAGE_NONE)  # warm start and warnings too
         if rng is not None:
             self.qpos[ids] += rng.uniform(-0.1, 0.1, (len(ids), self.qpos.shape[1]))
@@ -173,7 +173,7 @@ class Robots:
         return torch.from_numpy(np.concatenate([self.qpos[:, self.places:], self.qvel], 1)).float()
 
     def age(self):
-        """Environment steps since each robot's reset, (n, 1)."""
+        """Environment steps of each robot's episode so far, (n, 1)."""
         return torch.from_numpy(np.rint(self.time / self.step_seconds)).float()[:, None]
 
     def step(self, action):
@@ -250,8 +250,8 @@ class Actor(nn.Module):
 # -------- execution of skills, Alg. 2, lines 13 to 16 and 19
 
 def closed_loop(c, reference, robots, scale):
-    """Commands (n, 2 or 1), trajectory units: c plus a share, FEEDBACK, of reference - place (in metres),
-    at most CORRECTION long."""
+    """Commands (n, 2 or 1), trajectory units: c plus FEEDBACK * (reference - place) / scale, shortened to
+    CORRECTION; reference and place in metres."""
     correction = FEEDBACK * (reference - robots.place()) / scale
     size = correction.norm(dim=1, keepdim=True)
     return c + correction * (CORRECTION / size.clamp(min=max(CORRECTION, 1e-9)))  # 0 switches it off
