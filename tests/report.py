@@ -230,7 +230,7 @@ def fig4():
         if len(pure):
             rows.append([name, str(len(pure))] + [f"{p:.2f} ({100 * c:.0f} %)" if p else "-" for p, c in zip(pure.mean(0), cover.mean(0))]
                         + [f"{pure.min():.2f}"])
-    return markdown(["purity (coverage)", "seeds", "speed", "direction", "curvature", "worst, - as 0"], rows, "Fig 4 is",
+    return markdown(["purity (coverage)", "seeds", "speed", "direction", "curvature", "least (unused: 0)"], rows, "Fig 4 is",
                     "python 02_train_wetvae.py") + picture("fig04_latent_traversals.png", "Fig 4")
 
 
@@ -373,7 +373,7 @@ def skill_claims():
         ["... nothing meaningful without labels", over_seeds([seed.max() < CLEAR for seed in line_none]), axes_text(line_none)],
         ["four factors in one model (Fig 13)", over_seeds(clear(four)), axes_text(four)],
         ["empty angles on the full circle (A.3.1)", over_seeds([gap > 5 for found in gaps for gap in found], what="models"),
-         "largest one, degrees: three factors {}; two (Fig 11) {}; four (Fig 13) {}".format(*gap_text)],
+         "largest gap, degrees (a gap: above 5): three factors {}; two (Fig 11) {}; four (Fig 13) {}".format(*gap_text)],
         ["executed skills are similar to predicted ones (Fig 5)", "no threshold",
          f"open loop: tracking error {errors[0]}; executed speed purity {errors[1]}"]]
 

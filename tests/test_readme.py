@@ -319,7 +319,7 @@ def test_empty_angles_are_those_of_all_models_on_the_full_circle(repo, found, ve
         ("polar", "polar", [13.5]), ("polar", "none", [99]), ("full", "full", found), ("four_factors", "four_factors", [0.3]))
         for seed, gap in enumerate(gaps)])
     (_, word, said), = [row for row in report.skill_claims() if row[0] == "empty angles on the full circle (A.3.1)"]
-    assert word == verdict and said == f"largest one, degrees: {text}"
+    assert word == verdict and said == f"largest gap, degrees (a gap: above 5): {text}"
 
 
 # ---------------------------------------------------------------- claims
