@@ -253,7 +253,7 @@ def check(source):
     if DISCOUNT == 1:
         stop("--discount must be below 1: no step is terminal, so values would have no bound")
     if METHOD == "dads" and (Z_DIM != 2 or SINGLE_RUN[0] * MULTI_RUN[0] > 1):
-        stop("DADS: --z_dim must be 2, and T, the first of --single_run and of --multi_run, must be 1")
+        stop("DADS needs --z_dim 2, and T, the first of --single_run and of --multi_run, must be 1")
     common.need_memory(300 * max(REPLAY, 2 * ROBOTS * SKILL_STEPS) + 50_000 * ROBOTS, "--replay or --robots")
     common.need_memory(400 * HIDDEN ** 2 + 1000 * UPDATES_PER_STEP * BATCH, "--hidden or --batch")
     common.need_memory(100_000 * (STARTS + NOISY * TRAVERSAL), "--starts, --noisy or --traversal")
@@ -357,8 +357,8 @@ class Log:
         policy = self.policy
         policy.updates, policy.env_steps = self.sac.updates, self.replay.added
         if not all(math.isfinite(value) for value in self.numbers.values()):
-            stop(f"a loss is not finite after {policy.updates} updates; lower --learning_rate, or go on from "
-                 "the last good checkpoint with --resume true", code=1)
+            stop(f"a loss is not finite after {policy.updates} updates; lower --learning_rate (or "
+                 "--reward_scale), or go on from the last good checkpoint with --resume true", code=1)
         reported = policy.curve[-1]["updates"] if policy.curve else 0
         if policy.updates < min(UPDATES, reported + UPDATES / REPORTS):
             return
