@@ -261,7 +261,7 @@ def execute(policy, robots, commands, hold, closed, deterministic):
     """Alg. 2, lines 13 to 16: hold each command (n, T, c_dim) for `hold` (H_z) steps. closed: feedback to
     a reference, which moves by each command. deterministic: mean actions. Returns the poses after each step,
     (T * hold, n, nq)."""
-    reference, poses, ever_unstable = robots.place(), [], False
+    reference, poses, unstable = robots.place(), [], np.zeros(0, bool)
     for c in commands.unbind(1):  # line 13
         for _ in range(hold):  # line 14
             asked = closed_loop(c, reference, robots, policy.scale) if closed else c
@@ -269,10 +269,8 @@ def execute(policy, robots, commands, hold, closed, deterministic):
             _, unstable = robots.step(a.numpy())
             reference = reference + policy.scale * c if closed else reference
             poses.append(robots.qpos.copy())
-            ever_unstable |= unstable
-    if np.any(ever_unstable):
-        print(f"{np.sum(ever_unstable)} of {len(robots.qpos)} simulations were unstable: these robots began "
-              "anew at the origin")
+    if unstable.any():  # since their last reset
+        print(f"{unstable.sum()} of {len(unstable)} simulations were unstable: these robots began anew")
     return np.stack(poses) if poses else np.zeros((0, *robots.qpos.shape))
 
 
@@ -516,12 +514,11 @@ def update_csv(path, rows, key):
 
 def read_csv(path):
     """The rows of a table (dicts of text). Exits with 2 if a spreadsheet has saved it in another form."""
-    with contextlib.suppress(UnicodeDecodeError):
-        text = path.read_text(encoding="utf-8-sig")  # with or without a byte order mark
-        rows = list(csv.DictReader(text.splitlines()))
-        if all(len(row) > 1 and None not in row and None not in row.values() for row in rows):
-            return rows
-    stop(f"{path} is no table with commas in UTF-8 any more: save it so, or move it away")
+    text = path.read_text(encoding="utf-8-sig", errors="replace")  # with or without a byte order mark
+    rows = list(csv.DictReader(text.splitlines()))
+    if "\ufffd" in text or not all(len(row) > 1 and None not in (*row, *row.values()) for row in rows):
+        stop(f"{path} is no table with commas in UTF-8 any more: save it so, or move it away")
+    return rows
 
 
 BLUE, RED, GREY = "#0072B2", "#D55E00", "#888888"
