@@ -173,9 +173,10 @@ def main():
             poses, plans = plan_and_execute(case, policy)
             if not examples:
                 follow_one_skill(case, policy, poses, *plans[0])
-            example = case, poses[:, 0], [paths[0].numpy() for _, paths in plans]  # trial 0
-            examples.setdefault((case.maze, case.method, case.mode, case.reward), example)
             distances = np.linalg.norm(poses[-1, :, :2] - case.goal, axis=1).tolist()
+            n = np.argsort(distances)[case.trials // 2]  # the example is the median trial
+            example = case, poses[:, n], [paths[n].numpy() for _, paths in plans]
+            examples.setdefault((case.maze, case.method, case.mode, case.reward), example)
             same = dict(maze=case.maze, reward=case.reward, method=case.method, mode=case.mode,
                         look_ahead=case.planned * case.hold * case.length, samples=case.samples,
                         seed=case.seed, policy_seed=case.policy_seed, policy=policy.sha256[:8],
@@ -408,7 +409,7 @@ def draw_fig07(rows, configurations, examples):
 
 
 def draw_examples(name, reward, rows, configurations, examples):
-    """Fig 8, 17, 18: planned and executed paths, a row per maze and method, a column per mode."""
+    """Fig 8, 17, 18: planned and executed paths of median trials, a row per maze, a column per mode."""
     shown = {key[:3]: example for key, example in examples.items() if key[3] == reward}
     if not shown:
         return print(f"no {name}: no trial has the {reward} reward")
