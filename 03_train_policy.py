@@ -207,7 +207,7 @@ class Sac(nn.Module):
         a_new, log_prob = self.actor(x)
         q1, q2 = (critic(torch.cat([x, a_new], 1)).squeeze(1) for critic in self.critics)
         q_new = torch.minimum(q1, q2)
-        actor_loss = (TEMPERATURE * log_prob - q_new).mean()  # entropy of actions, Eq. 6: of steps
+        actor_loss = (TEMPERATURE * log_prob - q_new).mean()  # Eq. 6, with the entropy of actions
         v_loss = 0.5 * ((self.value(x).squeeze(1) - (q_new - TEMPERATURE * log_prob).detach()) ** 2).mean()
         self.actor_adam.zero_grad()
         (actor_loss + v_loss).backward(inputs=[*self.actor.parameters(), *self.value.parameters()])
