@@ -2,7 +2,7 @@
 
 In: runs/dataset_*.npz of 01. Trains the WET-VAE (Eq. 4) and, to compare, the trajectory VAE (NONE: no labels,
 beta 1), finds which latent is which factor, and the relation functions. Out, below runs/:
-wetvae_<model>_seed<n>.pt, a figure and results/wetvae.csv. Takes 1.3 to 2 minutes on one core, half of
+wetvae_<model>_seed<n>.pt, a figure and results/wetvae.csv. Takes 1.2 to 2 minutes on one core, half of
 that with --experiment main. Expect (speed, direction, curvature; mean of 10 seeds) purity 0.91, 0.91, 0.92;
 the axes cover 67, 74, 55 % of the factors' ranges; relation weight 0.21 (the paper: -0.2; signs differ).
 """

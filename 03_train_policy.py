@@ -3,7 +3,7 @@
 In: wetvae_<DECODER>_seed<n>.pt of stage 2. The command c of a skill z_single is the decoder's first
 displacement. The reward is the decoder's log-likelihood of the step that the robot makes (Eq. 6).
 Out: runs/policy_<experiment>_seed<n>.pt, Fig 5 (15, 16) and a row of runs/results/policies.csv.
-Takes 12 to 15 minutes on two cores (135 to 112 updates/s). Expect, mean of 3 seeds: tracking error 0.10
+Takes 11 to 15 minutes on two cores (149 to 112 updates/s). Expect, mean of 3 seeds: tracking error 0.10
 in open loop; in closed loop 0.03, a median following error of 0.08 m, and 1.3 % of the robots turn over.
 """
 import copy

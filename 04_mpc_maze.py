@@ -1,7 +1,7 @@
 """Stage 4: decoder + policy -> mazes solved without training in them (Sec. 5, Algorithm 2, Sec. 6.2).
 
 In: policy_<POLICY>_seed<n>.pt of stage 3. Out: <OUT>/results/<EXPERIMENT>.csv, a row per trial, and figures.
-  python 04_mpc_maze.py   Fig 3, 6, 8, 14, 17 and GIFs, 88 s on two cores; others: --experiment figure7 ..
+  python 04_mpc_maze.py   Fig 3, 6, 8, 14, 17, GIFs, 67 to 90 s on two cores; others: --experiment figure7 ..
 Expect, with --policy_seeds 0,1,2, mean final distances over 3 x 50 trials (dense maze 1, 2; sparse maze 1, 2)
 of 5.3, 4.4, 5.9, 9.3 m as printed; 1.5, 2.6, 4.5, 5.2 m planned with commands; 0.4, 0.8, 4.0, 3.7 m in closed
 loop. The start is 26.8 m from the goal; the shortest path that stays 1 m from the walls is 36.4 m long.
