@@ -328,7 +328,7 @@ def follow_one_skill(case, policy, poses, z, paths):
     """Print the first plan's skill of trial 0, its predicted and its executed end."""
     ends = *paths[0, case.length], *poses[case.hold * case.length, 0, :2]
     print(f"the first skill of trial 0, {case.title}:")
-    print("  z:", *(f"{value:.2f}" for value in z[0]), f" ({', '.join(policy.names)})")
+    print("  z:", *(f"{value:.2f}" for value in z[0]), "", *policy.names)  # names: of WEDIS alone
     print("  predicted end ({:.2f}, {:.2f}) m, executed ({:.2f}, {:.2f}) m".format(*ends))
 
 

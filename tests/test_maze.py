@@ -497,7 +497,7 @@ def test_one_skill_is_followed_from_z_to_metres(s4, stage, monkeypatch):
     lines = stage(mazes="maze1").out.splitlines()
     first = lines.index("the first skill of trial 0, wedis printed, maze1 dense, N = 4, ant_semi seed 0:")
     poses, [(z, paths)] = kept[0]
-    assert lines[first + 1] == "  z: {:.2f} {:.2f} {:.2f}  (speed, direction, curvature)".format(*z[0])
+    assert lines[first + 1] == "  z: {:.2f} {:.2f} {:.2f}  speed direction curvature".format(*z[0])
     predicted, executed = paths[0, 5], poses[200, 0, :2]
     assert "predicted end ({:.2f}, {:.2f}) m".format(*predicted) in lines[first + 2]
     assert "executed ({:.2f}, {:.2f}) m".format(*executed) in lines[first + 2]
