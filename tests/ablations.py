@@ -1,7 +1,8 @@
 """What each departure from the paper does: python tests/ablations.py FOLDER writes results/ablations.csv
 
 FOLDER/<name>_s<seed>/policy_ant_semi_seed<seed>.pt: policies of 03 that were trained with one thing set back to the paper's
-value (name `shipped`: nothing). Each is measured as 03 does, and plans in Maze 1 as 04 does; about a minute each. Rows made
+value (name `shipped`: nothing), by python 03_train_policy.py --updates 50000 --threads 1 --seed <seed> --out
+FOLDER/<name>_s<seed> and the flags in SET_BACK below. Each is measured as 03 does, and plans in Maze 1 as 04 does; about a minute each. Rows made
 with the same policy and constants are kept. tests/report.py makes of them a table, and the effects in README.md.
 python tests/ablations.py closed   what the parts of the closed loop do to the shipped ant_semi policies, without training:
 results/closed_loop.csv, 7 minutes.
@@ -33,6 +34,11 @@ MEASURES = {  # column -> in words, format, factor
     "maze1_success": ("Maze 1, success, %", ".0f", 100),
 }
 IN_EACH_CELL = ("tracking_error", "tracking_error_closed", "fall_rate")
+SET_BACK = {  # name -> flags of 03
+    "shipped": "", "base_frame": "--base_frame false", "relabelled": "--relabelled 0", "no_floor": "--floor_start 0 --floor_end 0",
+    "schedules": "--averaged 0 --decay_from 1", "reward_scale": "--reward_scale 1 --temperature 0.01", "skill_steps": "--skill_steps 200",
+    "actor_every": "--actor_every 1", "rate": "--learning_rate 3e-4 --decay_from 1",
+    "variance": "no flag: 0.05 in place of STEP_SCALE ** 2 in `reward`"}
 LABEL_MODELS = dict(own_axis="warm_up", beta_warm_up="own_axis", own_axis_and_warm_up="plain")  # rows `seeds` of 02
 
 
@@ -124,16 +130,18 @@ def closed_table(rows):
 # ---------------------------------------------------------------- numbers for both READMEs
 
 def means(rows, name):
-    """Means over the seeds of an ablation and of `shipped`, and what seeds of `shipped` differ by (nan: there is one), by
-    measure. None if there are none."""
-    own_rows, shipped_rows = ([row for row in rows if row["without"] == who] for who in (name, "shipped"))
-    if not (own_rows and shipped_rows):
+    """Means over the seeds of an ablation, and over those seeds of `shipped`, and what all seeds of `shipped` differ by (nan:
+    there is one), by measure; alone: the only seed of the ablation if `shipped` has more. None if there are none."""
+    own_rows, all_shipped = ([row for row in rows if row["without"] == who] for who in (name, "shipped"))
+    seeds = {row["seed"] for row in own_rows}
+    same = [row for row in all_shipped if row["seed"] in seeds]
+    if not same:
         return None
-    found = {}
+    found = dict(seeds=len(own_rows), alone=min(seeds) if len(seeds) == 1 < len(all_shipped) else None)
     for column, (_, _, factor) in MEASURES.items():
-        own, shipped = ([factor * float(row.get(column) or "nan") for row in some] for some in (own_rows, shipped_rows))
-        found[column] = np.mean(own), np.mean(shipped), np.ptp(shipped) if len(shipped) > 1 else np.nan
-    return SimpleNamespace(seeds=len(own_rows), **found)
+        own, shipped, every = ([factor * float(row.get(column) or "nan") for row in some] for some in (own_rows, same, all_shipped))
+        found[column] = np.mean(own), np.mean(shipped), np.ptp(every) if len(every) > 1 else np.nan
+    return SimpleNamespace(**found)
 
 
 def table(rows):
@@ -141,13 +149,13 @@ def table(rows):
     lines = []
     for name in dict.fromkeys(row["without"] for row in sorted(rows, key=lambda row: row["without"] != "shipped")):
         found = means(rows, name)
-        cells = [f"`{name}`", str(found.seeds) if found else "`shipped` is missing"]
+        cells = [f"`{name}`", SET_BACK.get(name) or "-", str(found.seeds) if found else "`shipped` is missing"]
         for column, (_, form, _) in MEASURES.items() if found else ():
             own, shipped, two_seeds = getattr(found, column)
             units = f" ({(own - shipped) / two_seeds:+.1f})" if name != "shipped" and two_seeds > 0 else ""
             cells.append("-" if np.isnan(own) else f"{own:{form}}{units}")
-        lines.append("| " + " | ".join(cells + ["-"] * (2 + len(MEASURES) - len(cells))) + " |")
-    head = ["without", "seeds", *(words for words, _, _ in MEASURES.values())]
+        lines.append("| " + " | ".join(cells + ["-"] * (3 + len(MEASURES) - len(cells))) + " |")
+    head = ["without", "flags of 03", "seeds", *(words for words, _, _ in MEASURES.values())]
     return ["| " + " | ".join(head) + " |", "|---" * len(head) + "|", *lines] if lines else []
 
 
@@ -166,7 +174,7 @@ def effect(name, results):
         change = abs(own - shipped) / max(np.nan_to_num(two_seeds), abs(shipped) / 5, 2.0 if factor == 100 else 1e-9)
         if change > moved and column not in (*IN_EACH_CELL, "updates_per_second"):
             text, moved = f"; {words}: {own:{form}} instead of {shipped:{form}}", change
-    return f"{error:.2f} / {closed:.2f}, {falls:.0f} %{text}"
+    return (f"seed {found.alone}: " if found.alone else "") + f"{error:.2f} / {closed:.2f}, {falls:.0f} %{text}"
 
 
 def label_effect(labels, rows):

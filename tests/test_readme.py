@@ -395,14 +395,27 @@ def test_the_effect_of_a_departure_is_three_measures_and_the_one_that_moves_most
     closed, falls, p90 = same["tracking_error_closed"], 100 * same["fall_rate"], same["follow_p90_m"]
     text = f"0.45 / {closed:.2f}, {(50.1 + falls) / 2:.0f} %; 90 % of following errors, m, closed loop: 6.00 instead of {p90:.2f}"
     assert ablations.effect("discount", report.results) == text
-    assert ablations.effect("rate", report.results) == f"0.19 / {closed:.2f}, {falls:.0f} %"
+    assert ablations.effect("rate", report.results) == f"seed 1: 0.19 / {closed:.2f}, {falls:.0f} %"
     assert ablations.effect("shipped", report.results) == f"0.16 / {closed:.2f}, {falls:.0f} %"
     assert ablations.effect("unheard", report.results) == ablations.NOT_YET
     lines = ablations.table(repo.read("ablations"))
-    assert len({line.count("|") for line in lines}) == 1 and lines[2].startswith("| `shipped` | 2 | 0.16 |")
-    assert "| 0.45 (+7.3) |" in lines[3]
+    assert len({line.count("|") for line in lines}) == 1 and lines[2].startswith("| `shipped` | - | 2 | 0.16 |")
+    assert "| 0.45 (+7.3) |" in lines[3] and "| 0.19 (+0.3) |" in lines[4]  # beside the same seed of shipped
     made = report.made("| discount | <!-- without discount -->old<!-- / --> | 0.99 |")
     assert made == f"| discount | <!-- without discount -->{text}<!-- / --> | 0.99 |"
+
+
+def test_each_ablation_says_with_which_flags_it_is_trained(s3, tmp_path):
+    names = {row["without"] for row in common.read_csv(ROOT / "results" / "ablations.csv")}
+    assert names == set(ablations.SET_BACK)
+    for name, flags in ablations.SET_BACK.items():
+        before = {key: value for key, value in vars(s3).items() if key.isupper()}
+        if flags.startswith("--"):
+            config, given = common.parse_flags(vars(s3), [*flags.split(), "--out", str(tmp_path)])
+            assert len(given) >= 2 and all(config[key] == vars(s3)[key] != before[key] for key in given)
+            vars(s3).update(before)
+        else:
+            assert name in ("shipped", "variance")
 
 
 def test_the_effect_of_a_departure_of_the_model_is_its_worst_seed(repo):
