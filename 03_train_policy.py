@@ -51,7 +51,7 @@ DISCOUNT: Share = 0.99        # gamma of Eq. 1
 SMOOTHING: Share = 0.01       # of the target value network, App. A.1.3
 REWARD_SCALE: float = 0.1     # of Eq. 6 (the paper: 1)
 TEMPERATURE: float = 0.003    # alpha, weight of the entropy (the paper: 0.01, that is 0.001 at our scale)
-FLOOR_START: float = 0.04     # metres, least deviation in the reward; with 0.01 at first robots stand still
+FLOOR_START: float = 0.04     # metres, least deviation in the reward; without one robots hardly move
 FLOOR_END: float = 0.01       # what it shrinks to until DECAY_FROM, geometrically (the paper: 0)
 
 # Baselines only
@@ -97,7 +97,7 @@ def reward(c, log_var, displacement, floor):
     c, the command, and log_var (B, 2 or 1): the decoder's mean and log-variance, trajectory units;
     displacement (B, 2 or 1), s_t+1 - s_t of Eq. 6, whose s is the place alone, and floor: metres."""
     variance = STEP_SCALE ** 2 * log_var.exp()  # square metres (the paper: 1/20 in place of STEP_SCALE ** 2)
-    variance = variance.clamp(min=floor ** 2)  # without a floor at first, robots learn to stand still
+    variance = variance.clamp(min=floor ** 2)  # without a floor robots hardly move
     return REWARD_SCALE * -0.5 * ((displacement - STEP_SCALE * c) ** 2 / variance).sum(1)
 
 

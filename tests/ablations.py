@@ -33,7 +33,7 @@ MEASURES = {  # column -> in words, format, factor
     "updates_per_second": ("updates a second", ".0f", 1), "maze1_distance_m": ("Maze 1, distance to the goal, m", ".1f", 1),
     "maze1_success": ("Maze 1, success, %", ".0f", 100),
 }
-IN_EACH_CELL = ("tracking_error", "tracking_error_closed", "fall_rate")
+IN_EACH_CELL = ("tracking_error", "tracking_error_closed", "fall_rate", "maze1_distance_m")
 SET_BACK = {  # name -> flags of 03
     "shipped": "", "base_frame": "--base_frame false", "relabelled": "--relabelled 0", "no_floor": "--floor_start 0 --floor_end 0",
     "schedules": "--averaged 0 --decay_from 1", "reward_scale": "--reward_scale 1 --temperature 0.01", "skill_steps": "--skill_steps 200",
@@ -131,13 +131,13 @@ def closed_table(rows):
 
 def means(rows, name):
     """Means over the seeds of an ablation, and over those seeds of `shipped`, and what all seeds of `shipped` differ by (nan:
-    there is one), by measure; alone: the only seed of the ablation if `shipped` has more. None if there are none."""
+    there is one), by measure. None if there are none."""
     own_rows, all_shipped = ([row for row in rows if row["without"] == who] for who in (name, "shipped"))
     seeds = {row["seed"] for row in own_rows}
     same = [row for row in all_shipped if row["seed"] in seeds]
     if not same:
         return None
-    found = dict(seeds=len(own_rows), alone=min(seeds) if len(seeds) == 1 < len(all_shipped) else None)
+    found = dict(seeds=len(own_rows))
     for column, (_, _, factor) in MEASURES.items():
         own, shipped, every = ([factor * float(row.get(column) or "nan") for row in some] for some in (own_rows, same, all_shipped))
         found[column] = np.mean(own), np.mean(shipped), np.ptp(every) if len(every) > 1 else np.nan
@@ -160,21 +160,16 @@ def table(rows):
 
 
 def effect(name, results):
-    """What a departure does, in plain words: tracking error in open and closed loop and falls without it; and of all other
-    measures of the policy the one that moves most, as a share of what two seeds differ by, or of a fifth of its value if that
-    is more (or of 2, if it is in per cent). results: reads a file of results/ by its name."""
+    """What a departure does: tracking error in open / closed loop, falls in closed loop and the distance to the goal in Maze 1
+    without it, the mean of its seeds; of `shipped`, or if there is one seed, by seed. results: reads a file of results/."""
     if name in LABEL_MODELS:
         return label_effect(LABEL_MODELS[name], results("wetvae"))
-    found, moved, text = means(results("ablations"), name), 1.0, ""
-    if not found:
-        return NOT_YET
-    (error, _, _), (closed, _, _), (falls, _, _) = (getattr(found, column) for column in IN_EACH_CELL)
-    for column, (words, form, factor) in MEASURES.items():
-        own, shipped, two_seeds = getattr(found, column)
-        change = abs(own - shipped) / max(np.nan_to_num(two_seeds), abs(shipped) / 5, 2.0 if factor == 100 else 1e-9)
-        if change > moved and column not in (*IN_EACH_CELL, "updates_per_second"):
-            text, moved = f"; {words}: {own:{form}} instead of {shipped:{form}}", change
-    return (f"seed {found.alone}: " if found.alone else "") + f"{error:.2f} / {closed:.2f}, {falls:.0f} %{text}"
+    rows, cells = [row for row in results("ablations") if row["without"] == name], []
+    for group in [[row] for row in rows] if name == "shipped" or len(rows) == 1 else [rows] * bool(rows):
+        error, closed, falls, away = (np.mean([MEASURES[column][2] * float(row[column]) for row in group]) for column in IN_EACH_CELL)
+        seed = f"seed {group[0]['seed']}: " if len(group) == 1 else ""
+        cells.append(f"{seed}{error:.2f} / {closed:.2f}, {falls:.0f} %, {away:.1f} m")
+    return "; ".join(cells) or NOT_YET
 
 
 def label_effect(labels, rows):

@@ -122,10 +122,8 @@ def number(text, form=".2f", scale=1.0):
 
 
 def interval(values):
-    """95 % bootstrap interval of the mean. values (n,): seeds are drawn anew; (policies, trials): policies and trials
-    of each (the hierarchical bootstrap), for trials of one policy alone say nothing about the next policy."""
-    means = stage4.resampled_means(np.atleast_2d(values), np.random.default_rng(0))
-    return tuple(np.quantile(means, [0.025, 0.975]))
+    """95 % interval of the mean. values: (n,), or (policies, trials)."""
+    return stage4.interval(np.atleast_2d(values))
 
 
 def by_policy(rows, column):
@@ -177,7 +175,8 @@ def mazes():
     trials = " or ".join(f"{n} {'policy' if n == 1 else 'policies'} x {trials} trials" for n, trials in shapes)
     return markdown(["maze", "reward", *(NAMES[mode] for mode in MODES)], rows, "The mazes are", "python 04_mpc_maze.py") + [
         "", f"Mean distance to the goal at the end, and share of trials that end within {stage4.EPSILON:g} m of it, with N = {most:,} "
-        f"samples a plan; {trials}. The start is {math.hypot(*stage4.GOAL):.1f} m from the goal; the shortest path that stays "
+        f"samples a plan; {trials}. To the sparse reward all places within these {stage4.EPSILON:g} m are equal. "
+        f"The start is {math.hypot(*stage4.GOAL):.1f} m from the goal; the shortest path that stays "
         f"1 m from the walls is {SHORTEST_PATH} m long."][:2 * len(rows)]
 
 
@@ -543,7 +542,7 @@ SECTIONS = [
      "below 0.1). Abs corr: of latent and factor, over decoded draws of the prior. Range: decoded over z in "
      "[-1.5, 1.5], angles in degrees. Largest gap: empty angle of the directions that z_direction decodes to. "
      "Acceleration is a share of the speed per transition.", full_wetvae),
-    ("Over seeds", "An unused axis counts as 0. Intervals: 95 % bootstrap of the mean over seeds.", full_seeds),
+    ("Over seeds", "An unused axis counts as 0. Intervals: 95 %, Student's t over seeds.", full_seeds),
     ("Policies (03): policies.csv", "Tracking error: RMS(executed end - predicted end) / RMS(predicted end) over a grid of skills, "
      "100 steps from rest (SeCTAR: 25 draws, 50 steps). Following error: |end - sum of its commands| of random skills of 200 steps "
      "(Half-Cheetah: 120) from 400 noisy starts, three in a row. Falls: robots that turn over in that time. Baselines have no "
@@ -560,8 +559,8 @@ SECTIONS = [
      "batch relabelled, discount 0.995.", dads_tries),
     ("Parts of the closed loop: closed_loop.csv", "The shipped policies, executed with other laws of the closed loop (common.py, "
      "`closed_loop`), without training anew.", closed_loops),
-    ("Mazes (04): mazes.csv", "Intervals of all planning tables: 95 % bootstrap over policies and trials of each; with one "
-     "policy they say nothing about the next one.", lambda: full_planning("mazes")),
+    ("Mazes (04): mazes.csv", "Intervals of all planning tables: 95 %, Student's t over the policies' means; with one "
+     "policy over its trials, which says nothing about the next policy.", lambda: full_planning("mazes")),
     ("Mazes, each policy", "", lambda: full_planning("mazes", ("policy_seed",))),
     ("Fig 7: figure7.csv", "", lambda: full_planning("figure7")),
     ("Claims of Sec. 6.2.1: claims.csv", "A comparison holds if the whole interval of the difference is above 0, does not hold if "
