@@ -54,8 +54,8 @@ def comparisons(rows, stage, claims=CLAIMS, equal=False):
                     for method, n in ((better, n_better), (worse, n_worse)))
             if not (a.size and b.size):
                 continue
-            pairs = min(a.shape, b.shape)  # SeCTAR has one policy, the others three
-            gain = b[:pairs[0], :pairs[1]] - a[:pairs[0], :pairs[1]]
+            policies, trials = map(min, a.shape, b.shape)  # SeCTAR has one policy, the others three
+            gain = b[:policies, :trials] - a[:policies, :trials]
             low, high = stage.interval(gain)
             found.append(dict(claim=words, against="rivals" if {better, worse} & set(RIVALS) else "ablations", mode=mode)
                          | dict(look_ahead="") | where | dict(

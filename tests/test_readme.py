@@ -339,6 +339,9 @@ def test_claims_are_judged_by_the_interval_of_the_difference(s4):
         (s_dads, "commands", "wedis_s", "dads"): ("does not hold", "rivals")}
     row = found[best, "printed", "wedis", "wedis_s"]
     assert row["difference"] == pytest.approx(3, abs=0.5) and row["low"] < row["difference"] < row["high"]
+    few = as_read(planning_rows(3, seeds=(0,), trials=50) + planning_rows(6, method="wedis_s"))  # one policy beside three
+    (row,) = claims.comparisons(few, s4, {best: claims.CLAIMS[best]})
+    assert row["verdict"] == "holds" and (row["better_policies"], row["worse_policies"]) == (1, 3)
     again = claims.comparisons(as_read(planning_rows(99, "older")) + rows, s4)
     assert [row["difference"] for row in again] == [row["difference"] for row in found.values()]  # the settings written last
     assert claims.in_words(["holds"] * 3) == "holds (3 of 3 hold)"
