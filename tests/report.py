@@ -558,11 +558,12 @@ SECTIONS = [
      "(Half-Cheetah: 120) from 400 noisy starts, three in a row. Falls: robots that turn over in that time. Baselines have no "
      "closed loop. Pairs of numbers are open loop / closed loop. Speed: over the prior, WEDIS over the planner's range. Purity: of "
      "executed skills.", full_policies),
-    ("Without each departure: ablations.csv", "Policies with one thing set back to the paper's value, 50,000 updates: mean of the seeds, "
-     "and in brackets, if `shipped` has two seeds, the difference to its same seeds in units of what these two differ by, a rough "
-     "measure. Slowest, fastest skill: executed / predicted distance in open loop. Maze 1: dense reward, mode `commands`, N = 1000, "
-     "20 trials. An earlier loop had random corrections of commands and discount 0.98; they went after such runs (without: 0.33 / 0.26 and 0.28 / 0.16 "
-     "instead of 0.25 / 0.25). rewards.csv: tracking errors of trainings with other rewards, at equal updates.",
+    ("Without each departure: ablations.csv",
+     "Policies with one thing set back to the paper's value, 50,000 updates: mean of the seeds, and in brackets, if `shipped` has two seeds, "
+     "the difference to its same seeds in units of what these two differ by, a rough measure. Slowest, fastest skill: executed / predicted "
+     "distance in open loop. Maze 1: dense reward, mode `commands`, N = 1000, 20 trials. An earlier loop had random corrections of commands "
+     "and discount 0.98; they went after such runs (without: 0.33 / 0.26 and 0.28 / 0.16 instead of 0.25 / 0.25). rewards.csv: tracking "
+     "errors of trainings with other rewards, at equal updates.",
      full_ablations),
     ("Full trainings without a departure: policies.csv, full_trainings.csv", "100,000 updates: what acts late, half a training does not show. "
      "-: not measured.", full_trainings),
