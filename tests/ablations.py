@@ -2,8 +2,9 @@
 
 FOLDER/<name>_s<seed>/policy_ant_semi_seed<seed>.pt: policies of 03 that were trained with one thing set back to the paper's
 value (name `shipped`: nothing), by python 03_train_policy.py --updates 50000 --threads 1 --seed <seed> --out
-FOLDER/<name>_s<seed> and the flags in SET_BACK below. Each is measured as 03 does, and plans in Maze 1 as 04 does; about a minute each. Rows made
-with the same policy and constants are kept. tests/report.py makes of them a table, and the effects in README.md.
+FOLDER/<name>_s<seed> and the flags in SET_BACK below, some with 03 edited as EDITS says. Each is measured as 03 does, and plans in
+Maze 1 as 04 does; about a minute each. Rows made with the same policy and constants are kept. tests/report.py makes of them a table,
+and the effects in README.md.
 python tests/ablations.py closed   what the parts of the closed loop do to the shipped ant_semi policies, without training:
 results/closed_loop.csv, 7 minutes.
 """
@@ -37,8 +38,13 @@ IN_EACH_CELL = ("tracking_error", "tracking_error_closed", "fall_rate", "maze1_d
 SET_BACK = {  # name -> flags of 03
     "shipped": "", "base_frame": "--base_frame false", "relabelled": "--relabelled 0", "no_floor": "--floor_start 0 --floor_end 0",
     "schedules": "--averaged 0 --decay_from 1", "reward_scale": "--reward_scale 1 --temperature 0.01", "skill_steps": "--skill_steps 200",
-    "actor_every": "--actor_every 1", "rate": "--learning_rate 3e-4 --decay_from 1",
-    "variance": "no flag: 0.05 in place of STEP_SCALE ** 2 in `reward`"}
+    "actor_every": "--actor_every 1", "rate": "--learning_rate 3e-4 --decay_from 1", "hidden": "--hidden 512", "robots": "--robots 64",
+    "variance": "", "together": "",
+    "paper": "--base_frame false --relabelled 0 --floor_start 0 --floor_end 0 --averaged 0 --decay_from 1 --reward_scale 1 "
+    "--temperature 0.01 --skill_steps 200 --actor_every 1 --learning_rate 3e-4 --hidden 512 --updates 17500"}  # in the same minutes
+VARIANCE = ("variance = STEP_SCALE ** 2 * log_var.exp()", "variance = 0.05 * log_var.exp()")
+TOGETHER = ("    robots.time[:] = rng.integers(0, EPISODE, ROBOTS) * robots.step_seconds\n", "")
+EDITS = {"variance": [VARIANCE], "together": [TOGETHER], "paper": [VARIANCE, TOGETHER]}  # name -> in 03, (text, what replaces it)
 LABEL_MODELS = dict(own_axis="warm_up", beta_warm_up="own_axis", own_axis_and_warm_up="plain")  # rows `seeds` of 02
 
 
@@ -149,13 +155,15 @@ def table(rows):
     lines = []
     for name in dict.fromkeys(row["without"] for row in sorted(rows, key=lambda row: row["without"] != "shipped")):
         found = means(rows, name)
-        cells = [f"`{name}`", SET_BACK.get(name) or "-", str(found.seeds) if found else "`shipped` is missing"]
+        edits = [f"`{old.strip()}` -> `{new}`" if new else f"without `{old.strip()}`" for old, new in EDITS.get(name, [])]
+        back = "; ".join([SET_BACK.get(name), *edits] if SET_BACK.get(name) else edits)
+        cells = [f"`{name}`", back or "-", str(found.seeds) if found else "`shipped` is missing"]
         for column, (_, form, _) in MEASURES.items() if found else ():
             own, shipped, two_seeds = getattr(found, column)
             units = f" ({(own - shipped) / two_seeds:+.1f})" if name != "shipped" and two_seeds > 0 else ""
             cells.append("-" if np.isnan(own) else f"{own:{form}}{units}")
         lines.append("| " + " | ".join(cells + ["-"] * (3 + len(MEASURES) - len(cells))) + " |")
-    head = ["without", "flags of 03", "seeds", *(words for words, _, _ in MEASURES.values())]
+    head = ["without", "flags of 03, edits in it", "seeds", *(words for words, _, _ in MEASURES.values())]
     return ["| " + " | ".join(head) + " |", "|---" * len(head) + "|", *lines] if lines else []
 
 
@@ -170,6 +178,22 @@ def effect(name, results):
         seed = f"seed {group[0]['seed']}: " if len(group) == 1 else ""
         cells.append(f"{seed}{error:.2f} / {closed:.2f}, {falls:.0f} %, {away:.1f} m")
     return "; ".join(cells) or NOT_YET
+
+
+def full_effect(name, results):
+    """The same without Maze 1, of full trainings: without a departure (its seeds), and of the shipped policies of these seeds."""
+    rows = [row for row in results("full_trainings") if (row["without"], row["loop"]) == (name, "as shipped")]
+    if name == "base_frame":
+        rows = [row for row in results("policies") if row["experiment"] == "ant_world_frame"]
+    seeds = {row["seed"] for row in rows}
+    shipped = [row for row in results("policies") if row["experiment"] == "ant_semi" and row["seed"] in seeds]
+    if not shipped:
+        return NOT_YET
+    cells = []
+    for group in (rows, shipped):
+        error, closed, falls = (np.mean([MEASURES[column][2] * float(row[column]) for row in group]) for column in IN_EACH_CELL[:3])
+        cells.append(f"{error:.2f} / {closed:.2f}, {falls:.1f} %")
+    return " instead of ".join(cells)
 
 
 def label_effect(labels, rows):

@@ -4,7 +4,8 @@ python tests/report.py --ship runs_a runs_b   copies policies, decoders, CSV row
     results/ and figures/ (rows replace those with the same KEYS; the later folder wins), makes the learning curves and the
     claims, then does what follows. After more than one folder, Fig 7 of all rows: python 04_mpc_maze.py --experiment figure7 --out .
 python tests/report.py   writes results/README.md, and in README.md each part between <!-- table NAME --> and <!-- end -->, and
-    each effect of a departure between <!-- without NAME --> and <!-- / --> (tests/ablations.py has the names)
+    each effect of a departure between <!-- without NAME --> (in half a training) or <!-- full NAME --> (in a full one) and
+    <!-- / --> (tests/ablations.py has the names)
 
 A table whose rows are not there is one sentence instead. tests/test_readme.py holds text and CSVs together.
 """
@@ -597,12 +598,13 @@ def results_readme():
 # ---------------------------------------------------------------- README.md
 
 BLOCK = re.compile(r"(<!-- table (\w+) -->\n)(.*?)(<!-- end -->)", re.S)
-WITHOUT = re.compile(r"(<!-- without (\w+) -->)(.*?)(<!-- / -->)")
+WITHOUT = re.compile(r"(<!-- (without|full) (\w+) -->)(.*?)(<!-- / -->)")
 
 
 def made(text):
     """README.md with each marked part made anew."""
-    text = WITHOUT.sub(lambda found: found[1] + ablations.effect(found[2], results) + found[4], text)
+    effect = {"without": ablations.effect, "full": ablations.full_effect}
+    text = WITHOUT.sub(lambda found: found[1] + effect[found[2]](found[3], results) + found[5], text)
     return BLOCK.sub(lambda found: found[1] + "\n".join(TABLES[found[2]]()).strip() + "\n" + found[4], text)
 
 

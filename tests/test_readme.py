@@ -407,17 +407,29 @@ def test_the_effect_of_a_departure_is_four_measures_of_its_seeds(repo):
     assert made == f"| discount | <!-- without discount -->{text}<!-- / --> | 0.99 |"
 
 
-def test_each_ablation_says_with_which_flags_it_is_trained(s3, tmp_path):
+def test_each_ablation_says_with_which_flags_and_edits_it_is_trained(s3, tmp_path):
     names = {row["without"] for row in common.read_csv(ROOT / "results" / "ablations.csv")}
-    assert names == set(ablations.SET_BACK)
+    source = (ROOT / "03_train_policy.py").read_text(encoding="utf-8")
+    assert names <= set(ablations.SET_BACK)
     for name, flags in ablations.SET_BACK.items():
+        assert flags or ablations.EDITS.get(name) or name == "shipped"
+        assert all(source.count(old) == 1 for old, _ in ablations.EDITS.get(name, []))
         before = {key: value for key, value in vars(s3).items() if key.isupper()}
-        if flags.startswith("--"):
-            config, given = common.parse_flags(vars(s3), [*flags.split(), "--out", str(tmp_path)])
-            assert len(given) >= 2 and all(config[key] == vars(s3)[key] != before[key] for key in given)
-            vars(s3).update(before)
-        else:
-            assert name in ("shipped", "variance")
+        config, given = common.parse_flags(vars(s3), [*flags.split(), "--out", str(tmp_path)])
+        assert all(config[key] == vars(s3)[key] != before[key] for key in given)
+        vars(s3).update(before)
+
+
+def test_the_effect_of_a_full_training_is_compared_with_the_same_seeds(repo):
+    assert ablations.full_effect("rate", report.results) == ablations.NOT_YET
+    row = dict(tracking_error=0.2, tracking_error_closed=0.1, fall_rate=0.02)
+    repo.write("full_trainings", [dict(without="rate", loop="as shipped", seed=1) | row, dict(without="rate", loop="an earlier one", seed=2) | row])
+    assert ablations.full_effect("rate", report.results) == ablations.NOT_YET  # nothing to compare it with
+    policies = [dict(experiment="ant_semi", seed=seed) | row | dict(tracking_error=error) for seed, error in ((0, 0.6), (1, 0.05))]
+    repo.write("policies", [*policies, dict(experiment="ant_world_frame", seed=0) | row | dict(tracking_error=0.3)])
+    assert ablations.full_effect("rate", report.results) == "0.20 / 0.10, 2.0 % instead of 0.05 / 0.10, 2.0 %"
+    assert ablations.full_effect("base_frame", report.results) == "0.30 / 0.10, 2.0 % instead of 0.60 / 0.10, 2.0 %"
+    assert report.made("<!-- full rate -->old<!-- / -->") == "<!-- full rate -->0.20 / 0.10, 2.0 % instead of 0.05 / 0.10, 2.0 %<!-- / -->"
 
 
 def test_the_effect_of_a_departure_of_the_model_is_its_worst_seed(repo):
