@@ -1,9 +1,9 @@
 """Stage 1: factors -> trajectories (App. A.1.1, Table 1, Fig 9).
 
 Draws the factors of interest and makes of each draw a trajectory of T transitions from the origin. Writes,
-below runs/, a figure and dataset_<experiment>_seed<seed>.npz with trajectories (N, T + 1, 2 or 1), factors
-(N, M), their names (M,) and ranges (M, 2), angles in radians. Takes 5 seconds. Expect, n = 100,000: a mean
-speed of 0.50, and 20 % of the trajectories straight.
+below runs/, dataset_<experiment>_seed<seed>.npz with trajectories (N, T + 1, 2 or 1), factors (N, M), their
+names (M,) and ranges (M, 2), angles in radians, and for main and full Fig 9. Takes 5 seconds. Expect of main:
+a mean speed of 0.50, and 20 % of the trajectories straight.
 """
 import math
 
@@ -15,7 +15,7 @@ from common import Count, Degrees, Positive, Share, Signed, plt, stop, weak_labe
 EXPERIMENT: str = "main"      # row of EXPERIMENTS below
 SEED: int = 0                 # random seed of the whole chain: data, decoder, policy
 OUT: str = "runs"             # folder of all that is written
-FIGURE: str = ""              # name of Fig 9, drawn for these FACTORS alone ("": dataset_<experiment>)
+FIGURE: str = ""              # name of Fig 9 ("": dataset_<experiment>); other FACTORS than these have none
 
 TRAJECTORIES: Count = 100_000  # N, App. A.1.1
 LENGTH: Count = 5             # T, transitions per trajectory
@@ -43,15 +43,15 @@ def make_trajectories(speed, direction=None, curvature=0.0, acceleration=0.0, le
     `speed` long and points in `direction`; each next one turns by `curvature` and is longer by `acceleration`
     times `speed`. Without direction: one dimension, (N, length + 1, 1), in which the speed has a sign."""
     t = np.arange(length)
-    steps = (speed[:, None] * (1 + np.multiply.outer(acceleration, t)))[..., None]
+    displacements = (speed[:, None] * (1 + np.multiply.outer(acceleration, t)))[..., None]  # (N, T, 1)
     if direction is not None:
         heading = direction[:, None] + np.multiply.outer(curvature, t)
-        steps = steps * np.stack([np.cos(heading), np.sin(heading)], -1)
-    return np.pad(steps.cumsum(1), ((0, 0), (1, 0), (0, 0)))  # s_0 is fixed at the origin, Sec. 4.1
+        displacements = displacements * np.stack([np.cos(heading), np.sin(heading)], -1)  # (N, T, 2)
+    return np.pad(displacements.cumsum(1), ((0, 0), (1, 0), (0, 0)))  # s_0 is the origin, Sec. 4.1
 
 
 def main():
-    config, _ = common.parse_flags(globals())
+    config, _ = common.parse_flags(globals())  # each constant with a type is a flag, such as --seed 1
     limits = dict(speed=(SPEED_LOW, SPEED_HIGH), direction=(-DIRECTION, DIRECTION),
                   curvature=(-CURVATURE, CURVATURE), acceleration=(-ACCELERATION, ACCELERATION))
     check(FACTORS.split(), limits)
@@ -61,9 +61,9 @@ def main():
     factors = {name: unit[name] * rng.uniform(*limits[name], TRAJECTORIES) for name in names}  # Table 1
     for name in names:
         if name in common.MULTI:
-            factors[name] *= rng.random(TRAJECTORIES) >= STRAIGHT
+            factors[name] *= rng.random(TRAJECTORIES) >= STRAIGHT  # 0 for some: straight lines, A.1.1
     trajectories = make_trajectories(**factors, length=LENGTH)  # Alg. 1, "Generate"
-    ranges = {name: unit[name] * np.array(limits[name]) for name in names}
+    ranges = {name: unit[name] * np.array(limits[name]) for name in names}  # the limits, in radians
     example = {}
     if names == list(EXAMPLE):
         example["example"] = make_trajectories(**EXAMPLE, length=LENGTH).astype(np.float32)
@@ -77,7 +77,7 @@ def main():
         print(f"{name:12}  U{limits[name]!s:16}  mean {shown.mean():.3f}  min {shown.min():.3f}  "
               f"max {shown.max():.3f}  exactly 0: {zero:.3f}")
     if example:
-        print("one skill, followed: speed 0.6, direction 20 degrees, curvature -10 degrees a transition")
+        print("one skill, followed (degrees):", *(f"{k} {v[0] / unit[k]:g}" for k, v in EXAMPLE.items()))
         print("  its points:", *(f"({x:.2f}, {y:.2f})" for x, y in example["example"][0]), " its labels:",
               *weak_labels(EXAMPLE, names, ranges)[0] + 1)
         draw(trajectories[:4000], {name: values[:4000] for name, values in factors.items()}, ranges)
@@ -89,12 +89,12 @@ def check(names, limits):
     """End with one line if these constants make no data set from which the factors can be learnt."""
     if "speed" not in names or not set(names) <= set(limits):
         stop(f"--factors {FACTORS!r} must name speed, and besides it only {' '.join(limits)}")
-    if "curvature" in names and "direction" not in names or "direction" in names and SPEED_LOW < 0:
+    if ("curvature" in names and "direction" not in names) or ("direction" in names and SPEED_LOW < 0):
         stop("--factors curvature needs direction; with direction --speed_low must be at least 0")
     for name in names:
         if name in common.MULTI and LENGTH == 1:
             stop(f"{name} needs --length 2 or more: it is a change from one transition to the next")
-        if name in common.MULTI and STRAIGHT == 1 or limits[name][0] >= limits[name][1]:
+        if (name in common.MULTI and STRAIGHT == 1) or limits[name][0] >= limits[name][1]:
             stop(f"{name} never changes: widen its range, lower --straight, or leave it out of --factors")
     common.need_memory(100 * TRAJECTORIES * (LENGTH + 1), "--trajectories or --length")
 

@@ -33,7 +33,7 @@ LABELLED: bool = True        # false: without the weak labels, the trajectory VA
 OWN_AXIS: bool = True        # label m is read from latent m alone (the paper: from all of z; axes can mix)
 GAMMA: float = 10.0          # weight of the label log-likelihoods, Eq. 4
 BETA: float = 9.0            # weight of the KL divergence, Eq. 4
-BETA_WARM_UP: Share = 0.5    # share of the updates in which beta grows (the paper: 0; more robots fall)
+BETA_WARM_UP: Share = 0.5    # share of the updates in which beta grows (the paper: 0; then more robots fall)
 HIDDEN: Count = 64           # width of every unit in Fig 1
 BATCH: Count = 512           # trajectories per update (the paper: 2048)
 EPOCHS: Count = 12           # passes over the data (the paper: 300)
@@ -42,19 +42,19 @@ Z_RANGE: Positive = 1.5      # relation functions are found, and traversals draw
 
 NONE = dict(LABELLED=False, GAMMA=0, BETA=1, BETA_WARM_UP=0)  # with BETA 9 its latents collapse
 PRINTED = dict(OWN_AXIS=False, BETA_WARM_UP=0)  # Eq. 4 as printed; mixes axes with some seeds
-POLAR = dict(DATA="polar", LABELS="speed direction")
-LINE = dict(DATA="speed_acc", LABELS="speed acceleration", EPOCHS=24, BETA=4, Z_RANGE=1)
-FOUR = dict(DATA="four_factors", LABELS="speed direction curvature acceleration", EPOCHS=60, BETA=4)
+POLAR = dict(DATA="polar", LABELS="speed direction")  # Fig 11
+LINE = dict(DATA="speed_acc", LABELS="speed acceleration", EPOCHS=24, BETA=4, Z_RANGE=1)  # Fig 12
+FOUR = dict(DATA="four_factors", LABELS="speed direction curvature acceleration", EPOCHS=60, BETA=4)  # Fig 13
 WEIGHTS = [(9, 0), (9, 1), (1, 10), (3, 10), (9, 10)]  # beta and gamma of our Fig 10
 MODELS = {  # a row names the constants, from DATA to Z_RANGE, in which a model differs
     "main": {}, "main_none": NONE, "full": dict(DATA="full"), "four_factors": FOUR,
     "polar": POLAR, "polar_cartesian": POLAR | dict(LABELS="x y"),
     "polar_none": POLAR | NONE | dict(LABELS="x y"), "speed_acc": LINE, "speed_acc_none": LINE | NONE,
-    # To be run with ten seeds: own axes and beta's warm-up, one of the two, neither (24 epochs), no labels.
+    # For ten seeds: main again; own axes alone; warm-up alone; neither (24 epochs); main_none again.
     "seeds": {}, "seeds_own_axis": dict(BETA_WARM_UP=0), "seeds_warm_up": dict(OWN_AXIS=False),
     "seeds_plain": PRINTED | dict(EPOCHS=24), "seeds_none": NONE, "beta_gamma": PRINTED,
 } | {f"beta_gamma_b{beta}_g{gamma}": PRINTED | dict(BETA=beta, GAMMA=gamma) for beta, gamma in WEIGHTS}
-FIGURES = {  # a column of a figure: title ("": the model's name), model, T of its traversals (0: of the data)
+FIGURES = {  # a column: title ("": model, beta and gamma), model, T of its traversals (0: T of the data)
     "fig04_latent_traversals": [
         ("(a) WET-VAE, T = 1", "main", 1), ("(b) WET-VAE, T = 5", "main", 5),
         ("(c) WET-VAE, T = 10", "main", 10), ("(d) trajectory VAE, T = 5", "main_none", 5)],
@@ -65,6 +65,22 @@ FIGURES = {  # a column of a figure: title ("": the model's name), model, T of i
 }
 
 
+def supervision(dataset, hyper):
+    """Displacements x (N, T, x_dim), the "distances" of App. A.1.2; the weak labels as one_hot (N, y_dim) for
+    the encoder, and as classes y (N, M) for the cross-entropy; {factor: its range}, in the order of z."""
+    x = np.diff(dataset["trajectories"], axis=1)
+    factors = dict(zip(dataset["names"].tolist(), dataset["factors"].T.astype(np.float64)))
+    ranges = dict(zip(factors, dataset["ranges"].tolist()))
+    if x.shape[2] == 2:  # Cartesian factors, Fig 11
+        factors |= factors_of(x.astype(np.float64), ["x", "y"])
+        ranges |= dict.fromkeys(("x", "y"), [-ranges["speed"][1], ranges["speed"][1]])
+    ranges = {name: ranges[name] for name in factors if name in hyper.LABELS.split()}
+    y = torch.from_numpy(weak_labels(factors, list(ranges), ranges))  # Alg. 1, "Compute labels"
+    one_hot = [F.one_hot(y[:, m], common.CLASSES[name]).float() for m, name in enumerate(ranges)]
+    one_hot = torch.cat(one_hot, 1) if hyper.LABELLED else torch.zeros(len(y), 0)
+    return torch.from_numpy(x), one_hot, y, ranges
+
+
 class Encoder(nn.Module):
     """q_phi(z | tau, y), Fig 1: an LSTM reads displacements and labels; its last state gives a Gaussian."""
     def __init__(self, x_dim, y_dim, z_dim, hidden):
@@ -73,7 +89,7 @@ class Encoder(nn.Module):
         self.head = nn.Sequential(nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 2 * z_dim))
 
     def forward(self, x, one_hot):
-        """x (B, T, x_dim), labels one_hot (B, all classes) -> mean, log-variance (B, z_dim) each."""
+        """x (B, T, x_dim), labels one_hot (B, y_dim) -> mean, log-variance (B, z_dim) each."""
         state = None
         for displacement in x.unbind(1):
             state = self.cell(torch.cat([displacement, one_hot], 1), state)  # labels at each step, App. A.1.2
@@ -87,7 +103,7 @@ class LabelDecoders(nn.Module):
         super().__init__()
         self.own_axis = own_axis
         sizes = [common.CLASSES[name] for name in labels]
-        if own_axis:  # in order; zero curvature, the first class, lies between negative and positive
+        if own_axis:  # order_k: class 0 of curvature is zero, between class 1, positive, and 2, negative
             self.order = [torch.tensor([0.0, 1.0, -1.0]) if name in MULTI else torch.arange(float(size))
                           for name, size in zip(labels, sizes)]
             self.scale = nn.Parameter(torch.full((len(labels),), 3.0))
@@ -114,7 +130,7 @@ def objective(encoder, decoder, label_decoders, x, one_hot, y):
     """The three terms of Eq. 3 and 4: sums over time, dimensions and labels, means over the batch.
     x (B, T, x_dim) displacements; the labels as one_hot (B, y_dim), side by side, and as classes y (B, M)."""
     mean, log_var = encoder(x, one_hot)
-    z = mean + torch.randn_like(mean) * (0.5 * log_var).exp()  # z ~ q(z | tau, y), in latents' order
+    z = mean + torch.randn_like(mean) * (0.5 * log_var).exp()  # z ~ q(z | tau, y); its axes are named later
     # sum_t log p(s_t | s_1:t-1, z); in place of s_1:t-1 the decoder reads its own means
     log_p_tau = log_normal(x, *decoder.decode_latents(z, x.shape[1])).sum((1, 2)).mean()
     logits = label_decoders(z)
@@ -123,45 +139,27 @@ def objective(encoder, decoder, label_decoders, x, one_hot, y):
     return log_p_tau, log_p_y, kl
 
 
-def supervision(dataset, hyper):
-    """What the WET-VAE reads of a data set of N trajectories: displacements x (N, T, x_dim), App. A.1.2; the
-    weak labels as one_hot (N, y_dim) and as classes y (N, M); {factor: its range}, in the order of z."""
-    x = np.diff(dataset["trajectories"], axis=1)
-    factors = dict(zip(dataset["names"].tolist(), dataset["factors"].T.astype(np.float64)))
-    ranges = dict(zip(factors, dataset["ranges"].tolist()))
-    if x.shape[2] == 2:  # Cartesian factors, Fig 11
-        factors |= factors_of(x.astype(np.float64), ["x", "y"])
-        ranges |= dict.fromkeys(("x", "y"), [-ranges["speed"][1], ranges["speed"][1]])
-    ranges = {name: ranges[name] for name in factors if name in hyper.labels.split()}
-    y = torch.from_numpy(weak_labels(factors, list(ranges), ranges))  # Alg. 1, "Compute labels"
-    one_hot = [F.one_hot(y[:, m], common.CLASSES[name]).float() for m, name in enumerate(ranges)]
-    one_hot = torch.cat(one_hot, 1) if hyper.labelled else torch.zeros(len(y), 0)
-    return torch.from_numpy(x), one_hot, y, ranges
-
-
 def train(x, one_hot, y, names, hyper):
     """Alg. 1, "WET-VAE training". x, one_hot, y: see supervision. names of the M factors. hyper: the model's
     hyperparameters, one for each constant from DATA to Z_RANGE. Returns encoder and decoder."""
-    encoder = Encoder(x.shape[2], one_hot.shape[1], len(names), hyper.hidden)
-    decoder = Decoder(len(names), x.shape[2], hyper.hidden)
-    label_decoders = LabelDecoders(names if hyper.labelled else [], len(names), hyper.hidden, hyper.own_axis)
+    encoder = Encoder(x.shape[2], one_hot.shape[1], len(names), hyper.HIDDEN)
+    decoder = Decoder(len(names), x.shape[2], hyper.HIDDEN)
+    label_decoders = LabelDecoders(names if hyper.LABELLED else [], len(names), hyper.HIDDEN, hyper.OWN_AXIS)
     networks = nn.ModuleList([encoder, decoder, label_decoders])  # Alg. 1: initialize phi, theta
     optimizer = torch.optim.Adam(networks.parameters(), fused=True)
-    updates = len(x) // hyper.batch  # of an epoch; the few trajectories left are skipped
-    for epoch in range(hyper.epochs):
-        for i, rows in enumerate(torch.randperm(len(x)).split(hyper.batch)[:updates]):  # Alg. 1: B ~ D
-            log_p_tau, log_p_y, kl = objective(*networks, x[rows], one_hot[rows], y[rows])  # y: supervision
-            progress = (epoch + i / updates) / hyper.epochs
-            beta = hyper.beta
-            if progress < hyper.beta_warm_up:
-                beta *= progress / hyper.beta_warm_up
-            loss = -(log_p_tau + hyper.gamma * log_p_y - beta * kl)  # Eq. 4; Alg. 1: optimize phi, theta
-            optimizer.param_groups[0]["lr"] = hyper.learning_rate * (1 - progress)
+    updates = len(x) // hyper.BATCH  # of an epoch; the few trajectories left are skipped
+    for epoch in range(hyper.EPOCHS):
+        for i, rows in enumerate(torch.randperm(len(x)).split(hyper.BATCH)[:updates]):  # Alg. 1: B ~ D
+            log_p_tau, log_p_y, kl = objective(*networks, x[rows], one_hot[rows], y[rows])  # y: computed once
+            progress = (epoch + i / updates) / hyper.EPOCHS
+            grown = progress / hyper.BETA_WARM_UP if progress < hyper.BETA_WARM_UP else 1
+            loss = -(log_p_tau + hyper.GAMMA * log_p_y - hyper.BETA * grown * kl)  # Eq. 4
+            optimizer.param_groups[0]["lr"] = hyper.LEARNING_RATE * (1 - progress)
             optimizer.zero_grad()
             loss.backward()
-            optimizer.step()
-        if epoch % 4 == 3 or epoch + 1 == hyper.epochs:
-            print(f"{epoch + 1:3d}/{hyper.epochs}  log p(tau|z) {log_p_tau:7.3f}  log p(y|z) {log_p_y:7.3f}  "
+            optimizer.step()  # Alg. 1: optimize phi, theta
+        if epoch % 4 == 3 or epoch + 1 == hyper.EPOCHS:
+            print(f"{epoch + 1:3d}/{hyper.EPOCHS}  log p(tau|z) {log_p_tau:7.3f}  log p(y|z) {log_p_y:7.3f}  "
                   f"KL {kl:6.3f}", flush=True)
     return encoder, decoder
 
@@ -170,16 +168,17 @@ def train(x, one_hot, y, names, hyper):
 
 @torch.no_grad()
 def check_factors(decoder, names, steps):
-    """Alg. 1, "Test: check factors in z", from the decoder alone: decodes samples of the prior, and matches
-    latents with factors by the largest total |correlation|. Sets decoder.axes, the signed permutation after
-    which axis m of z is factor m and + is more of it. Returns the |correlations| (M,)."""
+    """Alg. 1, "Test: check factors in z" (the paper: by eye, from traversals). Decodes samples of the prior,
+    and matches latents with factors by the largest total |correlation|. Sets decoder.axes, the signed
+    permutation after which axis m of z is factor m and + is more of it. Returns the |correlations| (M,)."""
     n = len(names)
     latents = torch.randn(5000, n, generator=torch.Generator().manual_seed(0))  # z ~ p(z)
     found = list(factors_of(decoder.decode_latents(latents, steps)[0].double().numpy(), names).values())
     with np.errstate(invalid="ignore", divide="ignore"):  # a factor that never changes has no correlation
         corr = np.nan_to_num(np.corrcoef(latents.double().numpy().T, found)[:n, n:])  # latents x factors
-    best = list(max(itertools.permutations(range(n)), key=lambda order: abs(corr[order, range(n)]).sum()))
-    decoder.axes.zero_()  # best[m]: the latent of factor m
+    orders = itertools.permutations(range(n))
+    best = list(max(orders, key=lambda order: abs(corr[order, range(n)]).sum()))  # best[m]: factor m's latent
+    decoder.axes.zero_()
     decoder.axes[range(n), best] = torch.from_numpy(np.where(corr[best, range(n)] < 0, -1, 1)).float()
     return abs(corr[best, range(n)])
 
@@ -190,11 +189,13 @@ def find_relation(decoder, names, steps, z_range):
     For each factor of z_multi: the weight in [-1, 1] with which single steps, chained by common.next_skill,
     come nearest to the free run, one decoder run of `steps` transitions with all of z, over a 13 x 13 grid
     of speed and factor. The error: RMS difference / RMS displacement. Returns {factor: weight}."""
-    grid, relation = torch.linspace(-z_range, z_range, 13), {}
+    grid = torch.linspace(-z_range, z_range, 13)
+    relation = {}
     for factor in [name for name in names if MULTI.get(name) in names]:
         z = torch.zeros(len(grid) ** 2, len(names))  # direction 0: a turn stays within the data's directions
         z[:, [0, names.index(factor)]] = torch.cartesian_prod(grid, grid)  # the first axis is the speed
-        free_run, errors = decoder(z, steps)[0], {}
+        free_run = decoder(z, steps)[0]
+        errors = {}  # of each weight
         for weight in sorted(np.linspace(-1, 1, 401).round(4).tolist(), key=abs):  # small ones win ties
             skills = SimpleNamespace(method="wedis", decoder=decoder, names=names, relation={factor: weight})
             chain = commands_of(skills, z, steps)
@@ -205,8 +206,6 @@ def find_relation(decoder, names, steps, z_range):
     return relation
 
 
-# ======== not needed to understand the method
-
 def main():
     config, given = common.parse_flags(globals())
     torch.set_num_threads(THREADS)
@@ -214,11 +213,10 @@ def main():
     models, datasets = check(columns, config, given)
     trained = {}
     for name, hyper in models.items():
-        constants = {field.upper(): value for field, value in vars(hyper).items()}
         if TRAIN:
-            print(f"\n{name}, seed {SEED}, beta {hyper.beta:g}, gamma {hyper.gamma:g}")
+            print(f"\n{name}, seed {SEED}, beta {hyper.BETA:g}, gamma {hyper.GAMMA:g}")
             clock = time.time()
-            x, one_hot, y, ranges = supervision(datasets[hyper.data], hyper)
+            x, one_hot, y, ranges = supervision(datasets[hyper.DATA], hyper)
             names, steps = list(ranges), x.shape[1]
             torch.manual_seed(SEED)
             encoder, decoder = train(x, one_hot, y, names, hyper)
@@ -226,24 +224,26 @@ def main():
             if not all(part.isfinite().all() for part in decoder.parameters()):
                 stop("the loss is not finite, and nothing was overwritten; lower --learning_rate", code=1)
             abs_corr = check_factors(decoder, names, steps).tolist()
-            relation = find_relation(decoder, names, steps, hyper.z_range)
-            made = common.digest(datasets[hyper.data]["config"] | dict(SEED=0, OUT="", FIGURE=""))
-            settings = constants | dict(DATASET=made)  # the same for all seeds
+            relation = find_relation(decoder, names, steps, hyper.Z_RANGE) if hyper.LABELLED else {}
+            made = common.digest(datasets[hyper.DATA]["config"] | dict(SEED=0, OUT="", FIGURE=""))
+            settings = vars(hyper) | dict(DATASET=made)  # the same for all seeds
             example = []
-            if hyper.labelled and "example" in datasets[hyper.data]:
-                example = follow_one_skill(encoder, decoder, datasets[hyper.data], hyper)
-            common.save(OUT, "wetvae", name, SEED, settings, settings=common.digest(common.made_by(settings)),
-                        decoder=decoder, encoder=encoder.state_dict(), names=names, ranges=ranges,
-                        relation=relation, length=steps, seconds=seconds, abs_corr=abs_corr, example=example)
-        trained[name] = load(OUT, "wetvae", name, SEED, **constants, CLASSES=common.CLASSES)
+            if hyper.LABELLED and "example" in datasets[hyper.DATA]:
+                example = follow_one_skill(encoder, decoder, datasets[hyper.DATA], hyper)
+            common.save(OUT, "wetvae", name, SEED, settings, decoder=decoder, encoder=encoder.state_dict(),
+                        names=names, ranges=ranges, relation=relation, length=steps, seconds=seconds,
+                        abs_corr=abs_corr, example=example)
+        trained[name] = load(OUT, "wetvae", name, SEED, **vars(hyper), CLASSES=common.CLASSES)
         measure(name, trained[name])
     draw_traversals(trained, columns)
 
 
+# ======== not needed to understand the method
+
 def hyperparameters(name, config, given):
     """The constants from DATA to Z_RANGE: a model's row overrides the file, a flag that was given both."""
     values, kinds = config | MODELS.get(name, {}) | given, common.types_of(globals())
-    return SimpleNamespace(**{key.lower(): common.convert(values[key], kinds[key], f"{key} of model {name}")
+    return SimpleNamespace(**{key: common.convert(values[key], kinds[key], f"{key} of model {name}")
                               for key in list(kinds)[list(kinds).index("DATA"):]})
 
 
@@ -256,20 +256,20 @@ def check(columns, config, given):
             stop(f"{column!r} in FIGURES must be (title, model, T), the model one of: {' '.join(MODELS)}")
     models = {name: hyperparameters(name, config, given) for _, name, _ in columns}
     for name, hyper in models.items():
-        if unknown := [key for key in MODELS[name] if key.lower() not in vars(hyper)]:
+        if unknown := [key for key in MODELS[name] if key not in vars(hyper)]:
             stop(f"{unknown[0]} of model {name} is no constant in which models can differ")
-    datasets = {data: load(OUT, "dataset", data, SEED) for data in {m.data for m in models.values()} if TRAIN}
-    for name, hyper in models.items() if datasets else ():
-        data, at = datasets[hyper.data], f"model {name}, data set {hyper.data}: "
-        make = f"python 01_make_dataset.py --seed {SEED} --experiment {hyper.data} --out {OUT}"
+    datasets = {data: load(OUT, "dataset", data, SEED) for data in {m.DATA for m in models.values()} if TRAIN}
+    for name, hyper in (models.items() if TRAIN else ()):
+        data, at = datasets[hyper.DATA], f"model {name}, data set {hyper.DATA}: "
+        make = f"python 01_make_dataset.py --seed {SEED} --experiment {hyper.DATA} --out {OUT}"
         known = data["names"].tolist() + ["x", "y"] * (data["trajectories"].shape[2] == 2)
-        if not hyper.labels or set(hyper.labels.split()) - set(known):
-            stop(f"{at}--labels {hyper.labels!r} must be factors of these data, which are: {' '.join(known)}")
+        if not hyper.LABELS or set(hyper.LABELS.split()) - set(known):
+            stop(f"{at}--labels {hyper.LABELS!r} must be factors of these data, which are: {' '.join(known)}")
         x, _, y, ranges = supervision(data, hyper)
-        if len(x) < hyper.batch:
-            stop(f"{at}{len(x)} trajectories are fewer than --batch {hyper.batch}: lower it, or {make}")
-        common.need_memory(160 * hyper.hidden ** 2, "--hidden")
-        for m, factor in enumerate(ranges if hyper.labelled else ()):
+        if len(x) < hyper.BATCH:
+            stop(f"{at}{len(x)} trajectories are fewer than --batch {hyper.BATCH}: lower it, or {make}")
+        common.need_memory(160 * hyper.HIDDEN ** 2, "--hidden")
+        for m, factor in enumerate(ranges if hyper.LABELLED else ()):
             counts = np.bincount(y[:, m], minlength=common.CLASSES[factor])
             mend = "take --data polar" if factor in ("x", "y") else f"make other data: {make}"
             if len(counts) > common.CLASSES[factor] or counts.min() < 0.005 * len(y):
@@ -283,7 +283,7 @@ def follow_one_skill(encoder, decoder, dataset, hyper):
     """Print what the model makes of the example that 01, 02 and 03 follow. Returns its z."""
     example = dataset | dict(trajectories=dataset["example"], factors=dataset["example_factors"])
     x, one_hot, _, ranges = supervision(example, hyper)
-    z = encoder(x, one_hot)[0] @ decoder.axes.T  # to the canonical axes: the inverse of Decoder.forward
+    z = encoder(x, one_hot)[0] @ decoder.axes.T  # latents -> axes of z: the inverse of Decoder.forward
     print("one skill, followed: the example of 01")
     print("  encoded: z =", ", ".join(f"{name} {value:+.2f}" for name, value in zip(ranges, z[0])))
     for text, rows in (("  its displacements:", x[0]), ("  decoded from z:   ", decoder(z, len(x[0]))[0][0])):
@@ -301,12 +301,12 @@ def traverse(decoder, axis, values, steps):
 
 
 def measure(name, model):
-    """Print what a model has learnt, and write a row per factor to results/wetvae.csv."""
+    """Print what a model has learnt, z from -1.5 to 1.5, and write a row per factor to results/wetvae.csv."""
     decoder, names, values = model["decoder"], model["names"], np.linspace(-1.5, 1.5, 61)
     curves = [factors_of(traverse(decoder, i, values, model["length"]), names) for i in range(len(names))]
     (C, purity), rows = common.cross_talk(curves, model["ranges"]), []
     group = max((group for group in MODELS if name.startswith(group + "_")), key=len, default=name)
-    same = dict(experiment=group, seed=SEED, labels=name.removeprefix(group + "_"))
+    same = dict(experiment=group, seed=SEED, labels=name.removeprefix(group + "_"))  # labels: the variant
     for i, factor in enumerate(names):
         curve = np.degrees(curves[i][factor]) if factor in ("direction", "curvature") else curves[i][factor]
         row = dict(factor=factor, abs_corr=model["abs_corr"][i], purity=purity[i],
@@ -322,7 +322,7 @@ def measure(name, model):
         if row["abs_corr"] < 0.5 or math.isnan(purity[i]):
             print(f"no latent means {factor}: do not use z_{factor}")
         rows.append(same | dict(beta=model["config"]["BETA"], gamma=model["config"]["GAMMA"]) | row | dict(
-            train_seconds=round(model["seconds"]), settings=model["settings"]))
+            train_seconds=round(model["seconds"]), settings=common.digest(model["config"])))
     common.update_csv(Path(OUT) / "results" / "wetvae.csv", rows, (*same, "factor", "settings"))
 
 

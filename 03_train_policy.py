@@ -589,28 +589,28 @@ def follow_one_skill(policy, source):
 def draw_skills(policy):
     """Fig 5, 15, 16: predicted and executed skills, a column per axis. On a rail y is the latent."""
     names = policy.names or [str(i + 1) for i in range(Z_DIM)]
-    rows = ("predicted", "executed, open loop", "executed, closed loop")[:2 + bool(policy.names)]
+    loops = (False, True)[:1 + bool(policy.names)]  # baselines have no closed loop
     rail = policy.decoder.x_dim == 1
-    figure, axes = plt.subplots(len(rows), len(names), squeeze=False, sharex="col", sharey="col",
-                                figsize=(2.8 * len(names) + 1, 2.8 * len(rows)))
+    figure, axes = plt.subplots(1 + len(loops), len(names), squeeze=False, sharex="col", sharey="col",
+                                figsize=(2.8 * len(names) + 1, 2.8 + 2.8 * len(loops)))
     for i, name in enumerate(names):
         run = MULTI_RUN if rail or name in MULTI else SINGLE_RUN
         values = np.linspace(-1, 1, 5)
         colours = ["#D55E00", "#009E73", "#0072B2", "#56B4E9", "#F0E442"]  # as the paper's
         z = traversal(policy, i, values)
-        paths = [predicted_path(policy, z, run)]
-        paths += [roll_out(policy, z, run, closed) for closed in (False, True)[:len(rows) - 1]]
+        paths = [predicted_path(policy, z, run), *(roll_out(policy, z, run, closed) for closed in loops)]
         for ax, path in zip(axes[:, i], paths):
             if rail:
                 path = np.dstack([path[..., 0], values[:, None] + 0 * path[..., 0]])
             every = (path.shape[1] - 1) // run[0] if run[0] < 9 else []  # dots: the ends of few transitions
             for line, value, colour in zip(path, values, colours):
                 ax.plot(*line.T, "o-", color=colour, lw=1.3, ms=3, markevery=every, label=f"{value:g}")
-        for ax in axes[:, i]:  # one scale for the column; speeds lie on one line: their y is enlarged
-            ax.axis("auto" if rail or name == "speed" else "square")
-        axes[0, i].set_title(f"$z_{{{name}}}$, $T$ = {run[0]}, $H_z$ = {run[1]}")
+        enlarged = "" if rail or name != "speed" else ", y enlarged"  # speeds lie on one line
+        for ax in axes[:, i]:
+            ax.axis("auto" if rail or enlarged else "square")
+        axes[0, i].set_title(f"$z_{{{name}}}$, $T$ = {run[0]}, $H_z$ = {run[1]}{enlarged}")
         axes[-1, i].set_xlabel("x (m)")
-    for ax, text in zip(axes[:, 0], rows):
+    for ax, text in zip(axes[:, 0], ("predicted", "executed, open loop", "executed, closed loop")):
         ax.set_ylabel(f"{text}\n{'latent' if rail else 'y (m)'}")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), title="latent", loc="outside right upper")
     common.save_figure(figure, OUT, FIGURE or f"skills_{EXPERIMENT}")

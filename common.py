@@ -60,7 +60,7 @@ SCRIPT = {"dataset": "01_make_dataset.py", "wetvae": "02_train_wetvae.py", "poli
 
 def weak_labels(factors, names, ranges):
     """Weak labels, App. A.1.1, A.3.1, Fig 9: factors {name: (N,)}, ranges {name: (low, high)} -> (N, M) int64
-    classes from 0. Curvature, acceleration: zero, positive, negative; the others: parts of their range."""
+    classes from 0. Curvature, acceleration: zero, positive, negative; others: equal parts of their range."""
     labels = []
     for name in names:
         if name in MULTI:

@@ -314,7 +314,7 @@ def test_each_model_alone_from_training_to_figure(s2, inside, out, name, monkeyp
     model = artifact(out, name)
     names = model["names"]
     rows = rows_of(out)
-    assert [row["factor"] for row in rows] == names and {row["settings"] for row in rows} == {model["settings"]}
+    assert [row["factor"] for row in rows] == names and {row["settings"] for row in rows} == {common.digest(model["config"])}
     assert {(row["experiment"], row["labels"]) for row in rows} == {GROUPS.get(name, (rows[0]["experiment"], rows[0]["labels"]))}
     assert set(model["ranges"]) == set(names) and len(model["abs_corr"]) == len(names) and model["length"] == 5
     axes = model["decoder"].axes
