@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
-import common  # before mujoco: it chooses how mujoco renders
+import common
 from common import (MULTI, SINGLE, Actor, Count, Decoder, Positive, Share, Threads, commands_of, execute,
                     factors_of, layers, plt, stop)
 import numpy as np
@@ -25,7 +25,7 @@ SEED: int = 0                 # random seed of the whole chain: data, decoder, p
 OUT: str = "runs"             # folder that everything is written to
 TRAIN: bool = True            # false: only measure and draw what is already trained
 RESUME: bool = False          # true: continue from the last checkpoint
-THREADS: Threads = 2          # 1: updates wait for the robots' step, with the same result; 3 and more: as 2
+THREADS: Threads = 2          # 1: updates wait for the robots' step; the result is the same
 
 DECODER: str = "main"         # model of 02 whose decoder is the reward
 ROBOT: str = "ant"            # ant or half_cheetah
@@ -93,7 +93,7 @@ MAY_DIFFER = (  # between a policy, or a checkpoint, and the run that uses it
 # -------- Eq. 5 in the form of Eq. 6, and Algorithm 1, policy training
 
 def reward(c, log_var, displacement, floor):
-    """REWARD_SCALE * log p_theta(s_t+1 | s_t, z), Eq. 6, (B,), less its normaliser, which no action changes.
+    """REWARD_SCALE * log p_theta(s_t+1 | s_t, z), Eq. 6, (B,), without the normaliser: no action changes it.
     c, the command, and log_var (B, 2 or 1): the decoder's mean and log-variance, trajectory units;
     displacement (B, 2 or 1), s_t+1 - s_t of Eq. 6, whose s is the place alone, and floor: metres."""
     variance = STEP_SCALE ** 2 * log_var.exp()  # square metres (the paper: 1/20 in place of STEP_SCALE ** 2)
@@ -102,7 +102,7 @@ def reward(c, log_var, displacement, floor):
 
 
 def train_wedis(decoder, names):
-    """Alg. 1, the second loop: a policy that follows single steps of the decoder, which `load` has frozen.
+    """Alg. 1, the second loop: a policy that follows single steps of the decoder, whose weights are fixed.
     Returns the policy. Shapes beside the lines: the Ant, n = ROBOTS, B = UPDATES_PER_STEP * BATCH = 2048."""
     m1 = sum(name in SINGLE for name in names)  # M_1; the axes of z_single come first
     m2 = len(names) - m1  # M_2
@@ -110,8 +110,9 @@ def train_wedis(decoder, names):
     s_dim, a_dim = robots.observe().shape[1], robots.ctrl.shape[1]
     sac = Sac(s_dim, decoder.x_dim, a_dim)  # Alg. 1: initialize psi, psi bar, psi hat
     replay = Replay(s=s_dim, a=a_dim, s2=s_dim, displacement=decoder.x_dim, z_single=m1)
+    policy = make_policy(sac, decoder, names, STEP_SCALE)  # it acts with sac.average
     # With --resume true, Log puts back the robots, replay and sac of the last checkpoint
-    log = Log(make_policy(sac, decoder, names, STEP_SCALE), robots, rng, replay, sac)
+    log = Log(policy, robots, rng, replay, sac)
     z_single = replay.latest(ROBOTS).z_single  # zeros at first, until a robot's skill is over
 
     while sac.updates < UPDATES:
@@ -119,14 +120,14 @@ def train_wedis(decoder, names):
         over = robots.age() % SKILL_STEPS == 0                                       # (n, 1)
         z_single = torch.where(over, torch.randn(ROBOTS, m1), z_single)              # (n, 2)
         z = torch.cat([z_single, torch.zeros(ROBOTS, m2)], 1)                        # (n, 3)
-        c = decoder(z, 1)[0][:, 0]  # the command: the decoder's first displacement for it; (n, 2)
+        c = decoder(z, 1)[0][:, 0]  # the command: the decoder's first displacement; (n, 2)
 
-        # Alg. 1: execute actions a ~ pi(a | s, z_single), here pi(a | s, c); a second core steps the robots
+        # Alg. 1: execute actions a ~ pi(a | s, z_single), here pi(a | s, c): unlike z, c can be rotated
         s = robots.observe()                                                         # (n, 27)
         a = sac.actor.act(s, c)                                                      # (n, 8)
         if replay.added < WARM_UP:
             a = torch.rand(a.shape) * 2 - 1
-        physics = submit(a)  # it runs while the networks learn
+        physics = submit(a)  # a second core steps the robots while the networks learn
 
         if replay.added >= WARM_UP:
             if sac.updates == 0:
@@ -142,17 +143,16 @@ def train_wedis(decoder, names):
             shrunk = min(1, sac.updates / max(DECAY_FROM * UPDATES, 1))              # from 0 to 1
             floor = FLOOR_START ** (1 - shrunk) * FLOOR_END ** shrunk                # metres
             r = reward(c, log_var, batch.displacement, floor)                        # (B,)
-            on_floor = (STEP_SCALE ** 2 * log_var.exp() < floor ** 2).float().mean()
 
             # Alg. 1: optimize psi, psi bar, psi hat with the SAC, BATCH steps at a time
-            log.numbers = sac.learn(batch, c, r) | dict(reward=r.mean(), on_floor=on_floor)
+            log.numbers = sac.learn(batch, c, r) | dict(reward=r.mean())
 
         # Alg. 1: collect the samples in the replay buffer R (after the updates, which ran meanwhile)
         displacement, unstable = physics.result()                                    # (n, 2) metres, (n,)
         replay.add(unstable, s=s, a=a, s2=robots.observe(), displacement=displacement, z_single=z_single)
         robots.reset(np.flatnonzero((robots.age()[:, 0].numpy() >= EPISODE) | unstable), rng)
         log.step()
-    return log.policy
+    return policy
 
 
 # -------- SAC (Haarnoja et al. 2017), App. A.1.3
@@ -174,8 +174,8 @@ class Sac(nn.Module):
         self.updates, self.losses = 0, {}
 
     def normalise(self, s):
-        """Fix the mean and deviation of the state, once, from random steps s (N, s_dim)."""
-        x = self.actor.inputs(s, torch.zeros(len(s), self.actor.arguments[1]))[:, :len(self.actor.s_mean)]
+        """Fix the mean and deviation of the state, once, from states s (N, s_dim) under random actions."""
+        x = self.actor.inputs(s, torch.zeros(len(s), 2))[:, :len(self.actor.s_mean)]  # clipped to +-10
         self.actor.s_mean.copy_(x.mean(0))
         self.actor.s_std.copy_(x.std(0, correction=0).clamp(min=1e-3))
         self.average.load_state_dict(self.actor.state_dict())
@@ -183,9 +183,9 @@ class Sac(nn.Module):
     def learn(self, batch, c, r):
         """Updates with the steps of batch, BATCH at a time. c (B, c_dim): their commands, also after the
         step, as if no skill ended; r (B,): rewards. Returns the last losses."""
-        left = (1 - self.updates / UPDATES) / max(1 - DECAY_FROM, 1e-9)
+        rate = LEARNING_RATE * min(1, (1 - self.updates / UPDATES) / max(1 - DECAY_FROM, 1e-9))
         for group in self.critic_adam.param_groups + self.actor_adam.param_groups:
-            group["lr"] = LEARNING_RATE * min(1, left)
+            group["lr"] = rate
         x, x2 = self.actor.inputs(batch.s, c), self.actor.inputs(batch.s2, c)
         for part in zip(x.split(BATCH), batch.a.split(BATCH), x2.split(BATCH), r.split(BATCH)):
             self.update(*part)
@@ -193,7 +193,7 @@ class Sac(nn.Module):
 
     def update(self, x, a, x2, r):
         """One update; no step is terminal. x, x2 (BATCH, 26 + 2): Actor.inputs before and after the step; a
-        (BATCH, 8); r (BATCH,). Actor and value share no parameter: one backward serves both."""
+        (BATCH, 8); r (BATCH,). One backward serves actor and value, and leaves out the critics."""
         q_target = r + DISCOUNT * self.target(x2).squeeze(1)
         q1, q2 = (critic(torch.cat([x, a], 1)).squeeze(1) for critic in self.critics)
         q_loss = 0.5 * ((q1 - q_target) ** 2 + (q2 - q_target) ** 2).mean()
@@ -212,7 +212,7 @@ class Sac(nn.Module):
         self.actor_adam.zero_grad()
         (actor_loss + v_loss).backward(inputs=[*self.actor.parameters(), *self.value.parameters()])
         self.actor_adam.step()
-        with torch.no_grad():
+        with torch.no_grad():  # target += SMOOTHING * (value - target); average alike, or (0) a copy
             torch._foreach_lerp_([*self.target.parameters()], [*self.value.parameters()], SMOOTHING)
             torch._foreach_lerp_([*self.average.parameters()], [*self.actor.parameters()], AVERAGED or 1.0)
         self.losses |= dict(actor_loss=actor_loss.detach())
@@ -274,7 +274,7 @@ def same_decoder(policy, decoder):
 
 
 def start_robots():
-    """ROBOTS robots near the origin, each at another moment of its episode, so that skills change at all
+    """ROBOTS robots near the origin, each at a random moment of its episode, so that skills change at all
     times; the generator of their starts; and what submits their next step to the second core."""
     robots, rng = common.Robots(common.robot_spec(ROBOT), ROBOTS), np.random.default_rng(SEED)
     robots.reset(np.arange(ROBOTS), rng)
@@ -302,7 +302,7 @@ class Replay:
 
     def __init__(self, **widths):
         self.widths, self.added = widths, 0
-        block = ROBOTS * SKILL_STEPS  # a skill of all robots; the table holds whole ones, at least two
+        block = ROBOTS * SKILL_STEPS  # in whole blocks, rows ROBOTS apart are of one robot
         self.table = torch.zeros(max(2, REPLAY // block) * block, sum(widths.values()))
 
     def add(self, unstable, **fields):
@@ -358,7 +358,7 @@ class Log:
         policy.updates, policy.env_steps = self.sac.updates, self.replay.added
         if not all(math.isfinite(value) for value in self.numbers.values()):
             stop(f"a loss is not finite after {policy.updates} updates; lower --learning_rate (or "
-                 "--reward_scale), or go on from the last good checkpoint with --resume true", code=1)
+                 "--reward_scale) and train anew: with --resume true the same would happen again", code=1)
         reported = policy.curve[-1]["updates"] if policy.curve else 0
         if policy.updates < min(UPDATES, reported + UPDATES / REPORTS):
             return
@@ -408,7 +408,7 @@ def train_dads(_decoder, _names):
             recent = replay.latest(RECENT)
             log.policy.scale = recent.displacement.square().mean().sqrt().clamp(min=1e-4).item()
             for _ in range(MODEL_UPDATES):
-                rows = -1 - torch.randint(len(recent.z), (MODEL_BATCH,))  # with the skills that made them
+                rows = -1 - torch.randint(len(recent.z), (MODEL_BATCH,))  # each step with its own skill
                 model_loss = -log_q(recent.displacement[rows], recent.z[rows]).mean()
                 adam.zero_grad()
                 model_loss.backward()
@@ -416,7 +416,7 @@ def train_dads(_decoder, _names):
             batch = replay.sample(UPDATES_PER_STEP * BATCH)
             fresh = torch.rand(len(batch.z), 1) < RELABELLED
             batch.z = torch.where(fresh, torch.rand(batch.z.shape) * 2 - 1, batch.z)
-            with torch.no_grad():  # log(L + 1) - log(1 + sum_i exp(log q(.|z_i) - log q(.|z))), L for all
+            with torch.no_grad():  # log(L + 1) - log(1 + sum_i q(.|z_i) / q(.|z)); all steps share the z_i
                 own = log_q(batch.displacement, batch.z)
                 others = log_q(batch.displacement[:, None], torch.rand(PRIOR_SAMPLES, Z_DIM) * 2 - 1)
                 ratios = (others - own[:, None]).clamp(-50, 50).exp().sum(1)
@@ -487,7 +487,7 @@ def traversal(policy, axis, values):
 
 def roll_out(policy, z, run, closed, rng=None, run_in=0):
     """Execute skills z (n, M) with mean actions, run = (T, H_z): places (n, T * H_z + 1, 2 or 1) in metres.
-    From rest, or with noise (a seed) from noisy starts; recorded after run_in steps."""
+    From rest, or, with rng, from noisy starts; recorded after run_in steps with the first command."""
     robots = common.Robots(common.robot_spec(ROBOT), len(z), THREADS)
     robots.reset(np.arange(len(z)), rng)
     commands = commands_of(policy, z, run[0])
@@ -559,7 +559,7 @@ def measure(policy, ranges, config):
     row = dict(experiment=EXPERIMENT, method=METHOD, robot=ROBOT, seed=SEED, updates=policy.updates,
                env_steps=policy.env_steps, threads=policy.config["THREADS"],
                train_minutes=policy.seconds / 60)
-    for closed, end in ((False, "_open"), (True, ""))[:1 + (METHOD == "wedis")]:
+    for closed, end in ((False, "_open"), (True, "")) if METHOD == "wedis" else ((False, "_open"),):
         row["tracking_error" + "_closed" * closed] = tracking(policy, closed)
         row |= {name + end: value for name, value in following(policy, closed).items()}
         purity = executed_cross_talk(policy, ranges, closed)[1] if policy.names else ()
@@ -575,7 +575,7 @@ def follow_one_skill(policy, source):
     """The example that 01, 02 and 03 follow: its command, and a step of the robot after 40 steps of it."""
     if METHOD != "wedis" or not source.get("example"):
         return
-    z = torch.tensor([source["example"]]) * torch.tensor([float(name in SINGLE) for name in policy.names])
+    z = torch.tensor([[v if name in SINGLE else 0.0 for name, v in zip(policy.names, source["example"])]])
     mean, log_var = (out[:, 0] for out in policy.decoder(z, 1))
     places = roll_out(policy, z, (1, 41), True)[0]
     step = torch.from_numpy(places[-1:] - places[-2:-1])
@@ -589,7 +589,7 @@ def follow_one_skill(policy, source):
 def draw_skills(policy):
     """Fig 5, 15, 16: predicted and executed skills, a column per axis. On a rail y is the latent."""
     names = policy.names or [str(i + 1) for i in range(Z_DIM)]
-    loops = (False, True)[:1 + bool(policy.names)]  # baselines have no closed loop
+    loops = (False, True) if METHOD == "wedis" else (False,)  # baselines have no closed loop
     rail = policy.decoder.x_dim == 1
     figure, axes = plt.subplots(1 + len(loops), len(names), squeeze=False, sharex="col", sharey="col",
                                 figsize=(2.8 * len(names) + 1, 2.8 + 2.8 * len(loops)))

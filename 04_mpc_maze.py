@@ -57,8 +57,8 @@ GOAL: tuple[Signed, Signed] = (24.0, 12.0)  # metres; the Ant starts at (0, 0)
 STUDY = dict(METHOD="wedis wedis_s wedis_nts dads dads_speed sectar", POLICY_SEEDS=(0, 1, 2), TRIALS=20)
 EXPERIMENTS = {  # a row names the constants in which an experiment differs; its name is that of its CSV
     "mazes": {},
-    "figure7": STUDY | dict(SAMPLES=(10, 100, 300, 1000, 3000, 10_000), DRAW="fig07"),  # stopped, it goes on
-    # with --planned 99 --samples 1000: dense plans that look as far ahead as those of WEDIS, 600 steps
+    "figure7": STUDY | dict(SAMPLES=(10, 100, 300, 1000, 3000, 10_000), DRAW="fig07"),  # a rerun goes on
+    # needs --planned 99 --samples 1000, as METHODS override this row: dense plans of 600 steps, as WEDIS's
     "matched": STUDY | dict(METHOD="wedis_s wedis_nts", REWARDS="dense", DRAW=""),
     "fig18": dict(MAZES="s_maze obstacles", REWARDS="dense", MODES="printed closed", POLICY_SEEDS=(0, 1, 2),
                   DRAW="fig18"),
@@ -89,14 +89,15 @@ METHODS = {  # Table 2
 }
 
 # -------- Algorithm 2, Sec. 5; its lines are counted from "for i", each "end" is one
-# case: a Configuration (below), the constants of one run in lower case. policy: what 03 has saved, with
-# actor, decoder (DADS: its skill dynamics), names, relation, and scale, metres a step per trajectory unit.
+# case: a Configuration (below), the constants of one run in lower case. policy: what 03 has saved as
+# case.policy: actor, decoder (DADS: dynamics), names, relation, scale (metres a step per trajectory unit).
 
 def plan_and_execute(case, policy):
     """Algorithm 2 for case.trials robots side by side. Returns their poses (steps + 1, trials, nq), and for
     each i the first skills z_1* of the best plans, (trials, M), and the paths of these plans, (trials,
     horizon * T + 1, 2), metres."""
-    robots, pool = common.Robots(maze_spec(case), case.trials, THREADS), skill_pool(case, policy)
+    robots = common.Robots(maze_spec(case), case.trials, THREADS)
+    pool = skill_pool(case, policy)
     for n in range(case.trials):  # trial n of a policy starts alike for all methods, modes and mazes
         robots.reset([n], np.random.default_rng((case.seed, case.policy_seed, n)))
     torch.manual_seed(hash((case.seed, case.policy_seed, 1)))  # plans of its own for each policy
@@ -105,10 +106,10 @@ def plan_and_execute(case, policy):
     poses, plans = [robots.qpos.copy()[None]], []
     for i in range(skills):  # line 1
         horizon = min(case.planned, skills - i)  # a departure: no plan looks beyond the end of the episode
-        best = [plan(case, policy, pool, horizon, s0) for s0 in robots.place()]  # lines 2 to 11
-        z, paths = map(torch.stack, zip(*best))
-        # In all modes the Ant is commanded single steps of the decoder, chained by the f^m: (trials, T, 2)
-        commands = commands_of(policy, z, case.length)  # lines 12, 17 and 18, for all t
+        best_plans = [plan(case, policy, pool, horizon, s0) for s0 in robots.place()]  # lines 2 to 11
+        z, paths = map(torch.stack, zip(*best_plans))
+        # The policy is given commands, not z_single: the decoder's first displacements for (z_single, 0)
+        commands = commands_of(policy, z, case.length)  # lines 12, 17 and 18, for all t: (trials, T, 2)
         # lines 13 to 16, 19; in closed loop with mean actions
         poses.append(execute(policy, robots, commands, case.hold, closed, deterministic=closed))
         plans.append((z, paths))  # line 20: the robots are at s_0 of the next round
@@ -123,12 +124,12 @@ def plan(case, policy, pool, horizon, s0):
     picked = torch.randint(len(z), (case.samples, horizon))  # line 3; their distribution: skill_pool
     path = [state]
     for j in range(horizon):  # line 4
-        delta_j = delta[picked[:, j]]  # lines 5 and 6: decoded in skill_pool, already as steps; (N, T, 2)
+        delta_j = delta[picked[:, j]]  # lines 5 and 6: the displacements that skill_pool decoded, (N, T, 2)
         # Trajectory scaling, Fig 3, in metres. The paper prints s_0 where the planned state must stand
         path.append(state + policy.scale * case.hold * delta_j.cumsum(1))  # line 7
         state = path[-1][:, -1:]  # line 8
     path = torch.cat(path, 1)  # (N, H_P T + 1, 2)
-    # Sparse rewards tie (w_r if it arrives, else 0, without collisions): argmax takes the first, a random one
+    # Without collisions a sparse reward is w_r or 0, so plans tie: argmax takes the first, a random one
     best = planning_reward(path, case).argmax()  # lines 10 and 11
     return z[picked[best, 0]], path[best].clone()  # a copy: a view would keep all N paths in memory
 
@@ -137,7 +138,7 @@ def skill_pool(case, policy):
     """The skills that plans draw from: z (POOL, M), and the displacements (POOL, T, 2) that the planner
     predicts for them, trajectory units; the decoder's mean, without sampling (App. A.1.4)."""
     torch.manual_seed(hash((case.seed, case.policy_seed, 0)))
-    high = torch.full((policy.decoder.arguments[0],), case.z_range)
+    high = torch.full([len(policy.decoder.axes)], case.z_range)
     low = -high
     if "speed" in policy.names:  # the paper: U(-1.5, 0), for its axis points the other way
         low[policy.names.index("speed")] = 0
@@ -157,8 +158,6 @@ def planning_reward(path, case):
     return -distance - penalty  # r_d
 
 
-# ======== not needed to understand the method
-
 def main():
     runs = check(*common.parse_flags(globals()))
     torch.set_num_threads(1)  # tensors are small here; THREADS are for the physics
@@ -174,8 +173,8 @@ def main():
             if not examples:
                 follow_one_skill(case, policy, poses, *plans[0])
             distances = np.linalg.norm(poses[-1, :, :2] - case.goal, axis=1).tolist()
-            n = np.argsort(distances)[case.trials // 2]  # the example is the median trial
-            example = case, poses[:, n], [paths[n].numpy() for _, paths in plans]
+            median = np.argsort(distances)[case.trials // 2]  # the trial that is drawn
+            example = case, poses[:, median], [paths[median].numpy() for _, paths in plans]
             examples.setdefault((case.maze, case.method, case.mode, case.reward), example)
             same = dict(maze=case.maze, reward=case.reward, method=case.method, mode=case.mode,
                         look_ahead=case.planned * case.hold * case.length, samples=case.samples,
@@ -185,14 +184,16 @@ def main():
                    for n, distance in enumerate(distances)]
             own = common.update_csv(table, own, ("settings", "trial"))
         rows += own
-        distance = np.array([float(row["final_distance"]) for row in own])
-        print(f"{time.time() - start:4.0f} s  {case.title}: {distance.mean():.1f} m from the goal, "
-              f"{100 * np.mean(distance < case.epsilon):.0f} % within {case.epsilon:g} m" + " (known)" * kept,
+        ends = np.array([float(row["final_distance"]) for row in own])
+        print(f"{time.time() - start:4.0f} s  {case.title}: {ends.mean():.1f} m from the goal, "
+              f"{100 * np.mean(ends < case.epsilon):.0f} % within {case.epsilon:g} m" + " (known)" * kept,
               flush=True)
     print(f"wrote {table}")
     for name in DRAW.split():
         DRAWINGS[name](rows, [case for case, _, _ in runs], examples)
 
+
+# ======== not needed to understand the method
 
 @dataclass(frozen=True)
 class Configuration:
@@ -239,7 +240,7 @@ def configurations_of(method, maze, v):
 
 def check(config, given):
     """All runs: (configuration, policy, digest of its settings). Exits with 2, in a line that names the mend,
-    before any work, if one makes no sense. config: file and EXPERIMENTS; given: flags."""
+    before any work, if one makes no sense. config: file, EXPERIMENTS, flags; given: the flags alone."""
     def words(text, name, allowed):
         found = [text] if text in allowed else text.split()  # the name of a reader's own row may have blanks
         for word in found or [""]:
@@ -247,10 +248,10 @@ def check(config, given):
                 stop(f"unknown {word!r} in --{name}; allowed: {' '.join(allowed)}")
         return list(dict.fromkeys(found))
 
-    words(DRAW or "fig06", "draw", DRAWINGS)
-    of_a_run = "EXPERIMENT OUT THREADS DRAW METHOD MAZES".split()  # not for rows
+    words(DRAW or "fig06", "draw", DRAWINGS)  # "" draws nothing
+    of_a_run = "EXPERIMENT OUT THREADS DRAW METHOD MAZES".split()  # not for rows of MAZE and METHODS
     kinds, policies, runs = common.types_of(globals()), {}, []
-    physics = {name: common.made_by({})[name] for name in ("FRAME_SKIP", "ant.xml")}  # a policy knows one
+    physics = {name: common.made_by({})[name] for name in ("FRAME_SKIP", "ant.xml")}  # as it was trained with
     for method, maze in product(words(METHOD, "method", METHODS), words(MAZES, "mazes", MAZE)):
         of, v = f"{method} in {maze}", config.copy()
         for name, value in (MAZE[maze] | METHODS[method]).items():
@@ -263,8 +264,7 @@ def check(config, given):
         words(v["REWARDS"], "rewards", ["dense", "sparse"])
         if not isinstance(walls, (list, tuple)):
             stop(f"{of}: WALLS is {walls!r}, but must be a list of (x0, x1, y0, y1)")
-        four = tuple[Signed, Signed, Signed, Signed]
-        v["WALLS"] = tuple(convert(wall, four, f"{of}: a wall") for wall in walls)
+        v["WALLS"] = tuple(convert(wall, tuple[(Signed,) * 4], f"{of}: a wall") for wall in walls)
         for x0, x1, y0, y1 in v["WALLS"]:
             if x0 >= x1 or y0 >= y1:
                 stop(f"{of}: a wall is {(x0, x1, y0, y1)}, but must be (x0, x1, y0, y1), x0 < x1, y0 < y1")
@@ -311,7 +311,7 @@ def maze_spec(case):
 def collides(path, walls, radius):
     """Which transitions of paths (N, K + 1, 2) touch a wall grown by radius, metres: (N, K) bool. Exact, by
     separating axes: segment and rectangle meet if they do along x, along y, and across the segment."""
-    parts = path.split(max(1, 50_000 // path.shape[1]))  # in the processor's cache
+    parts = path.split(max(1, 50_000 // path.shape[1]))  # in the cache: 5 times faster for 600 transitions
     if len(parts) > 1:
         return torch.cat([collides(part, walls, radius) for part in parts])
     x0, x1, y0, y1 = torch.tensor(walls, dtype=torch.float32).view(-1, 4).T[..., None, None]  # (walls, 1, 1)
@@ -333,7 +333,7 @@ def follow_one_skill(case, policy, poses, z, paths):
 
 
 def values_of(rows, column, **where):
-    """A column of the rows that agree with where: (policies, trials), in the order of the policies' seeds."""
+    """A column of the rows that agree with where: (policies, trials), in the order of the seeds as text."""
     found = {}
     for row in rows:
         if all(row[name] == str(value) for name, value in where.items()):
@@ -409,7 +409,7 @@ def draw_fig07(rows, configurations, examples):
 
 
 def draw_examples(name, reward, rows, configurations, examples):
-    """Fig 8, 17, 18: planned and executed paths of median trials, a row per maze, a column per mode."""
+    """Fig 8, 17, 18: what median trials plan and do; a row per method and maze, a column per mode."""
     shown = {key[:3]: example for key, example in examples.items() if key[3] == reward}
     if not shown:
         return print(f"no {name}: no trial has the {reward} reward")

@@ -78,7 +78,7 @@ def weak_labels(factors, names, ranges):
 
 class Decoder(nn.Module):
     """p_theta(tau | z), Fig 1: an LSTM over z and its own last mean -> a Gaussian over the next displacement.
-    If it read the true last displacement, it would need z for two steps only, and z would stay entangled."""
+    If it read the true last displacement, as in Eq. 3, two steps could tell it the factors without z."""
 
     def __init__(self, z_dim, x_dim, hidden):
         super().__init__()
@@ -267,11 +267,11 @@ def execute(policy, robots, commands, hold, closed, deterministic):
             asked = closed_loop(c, reference, robots, policy.scale) if closed else c
             a = policy.actor.act(robots.observe(), asked, deterministic)  # line 15
             _, unstable = robots.step(a.numpy())
-            reference = reference + policy.scale * c if closed else reference
+            reference = reference + policy.scale * c
             poses.append(robots.qpos.copy())
     if unstable.any():  # since their last reset
         print(f"{unstable.sum()} of {len(unstable)} simulations were unstable: these robots began anew")
-    return np.stack(poses) if poses else np.zeros((0, *robots.qpos.shape))
+    return np.reshape(poses, (-1, *robots.qpos.shape))
 
 
 # ======== not needed to understand the method

@@ -7,12 +7,13 @@ Maze 1 as 04 does; about a minute each. Rows made with the same policy and const
 and the effects in README.md.
 python tests/ablations.py closed   what the parts of the closed loop do to the shipped ant_semi policies, without training:
 results/closed_loop.csv, 7 minutes.
+python tests/ablations.py planner   what the departures of the planner do, with the same policies: results/planner.csv, 4 minutes.
 """
 import importlib
 import re
 import sys
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import torch
@@ -45,6 +46,10 @@ SET_BACK = {  # name -> flags of 03
 VARIANCE = ("variance = STEP_SCALE ** 2 * log_var.exp()", "variance = 0.05 * log_var.exp()")
 TOGETHER = ("    robots.time[:] = rng.integers(0, EPISODE, ROBOTS) * robots.step_seconds\n", "")
 EDITS = {"variance": [VARIANCE], "together": [TOGETHER], "paper": [VARIANCE, TOGETHER]}  # name -> in 03, (text, what replaces it)
+PLANNERS = {  # name -> flags of 04, and in 04, (text, what replaces it)
+    "as_shipped": ("", []), "radius": ("--radius 0", []), "horizon": ("", [("min(case.planned, skills - i)", "case.planned")]),
+    "pool": ("--pool 500000", []), "noise": ("", [("robots.reset([n], np.random.default_rng((case.seed, case.policy_seed, n)))",
+                                                   "robots.reset([n])")])}
 LABEL_MODELS = dict(own_axis="warm_up", beta_warm_up="own_axis", own_axis_and_warm_up="plain")  # rows `seeds` of 02
 
 
@@ -118,6 +123,45 @@ def closed_loops(stage3, folder, seeds):
     common.update_csv(ROOT / "results" / "closed_loop.csv", rows, ("loop", "seed"))
 
 
+# ---------------------------------------------------------------- departures of the planner
+
+def planners(folder, flags="--policy_seeds 0,1,2 --rewards dense --modes closed --draw fig06 --threads 1"):
+    """A row for each policy ant_semi in the folder, each maze and each planner: mean distance to the goal, and success."""
+    path, rows = ROOT / "04_mpc_maze.py", []
+    for name, (own_flags, edits) in PLANNERS.items():
+        source = path.read_text(encoding="utf-8")
+        for old, new in edits:
+            source = source.replace(old, new)
+        stage4 = sys.modules["edited_04"] = ModuleType("edited_04")  # a dataclass looks itself up there
+        stage4.__file__ = str(path)
+        exec(compile(source, path, "exec"), vars(stage4))
+        for c, policy, _ in stage4.check(*common.parse_flags(vars(stage4), ["--out", str(folder), *flags.split(), *own_flags.split()])):
+            poses, _ = stage4.plan_and_execute(c, policy)
+            distances = np.linalg.norm(poses[-1, :, :2] - c.goal, axis=1)
+            rows.append(dict(planner=name, maze=c.maze, policy_seed=c.policy_seed, distance_m=float(distances.mean()),
+                             success=float((distances < c.epsilon).mean())))
+            print(*rows[-1].values(), flush=True)
+    common.update_csv(ROOT / "results" / "planner.csv", rows, ("planner", "maze", "policy_seed"))
+
+
+def planner_effect(name, rows):
+    """Mean distance to the goal in Maze 1 and 2, over policies, with one departure of the planner set back."""
+    found = [[float(row["distance_m"]) for row in rows if (row["planner"], row["maze"]) == (name, maze)] for maze in ("maze1", "maze2")]
+    return "{:.1f} and {:.1f} m".format(*map(np.mean, found)) if all(found) else NOT_YET
+
+
+def planner_table(rows):
+    """Lines of markdown: a row for each planner, a cell for each policy."""
+    lines = []
+    for name in dict.fromkeys(row["planner"] for row in rows):
+        flags, edits = PLANNERS[name]
+        words = "; ".join([f"`{flags}`"] * bool(flags) + [f"`{old}` -> `{new}`" for old, new in edits]) or "-"
+        cells = [", ".join(f"{float(row['distance_m']):.1f} m {100 * float(row['success']):.0f} %" for row in rows
+                           if (row["planner"], row["maze"]) == (name, maze)) for maze in ("maze1", "maze2")]
+        lines.append(f"| {name} | {words} | {' | '.join(cells)} |")
+    return ["| planner | flags of 04, edits in it | Maze 1, seeds 0, 1, 2 | Maze 2 |", "|---|---|---|---|", *lines] if rows else []
+
+
 def closed_table(rows):
     """Lines of markdown: a row for each law, a cell for each seed."""
     head, seeds = ["closed loop"], list(dict.fromkeys(row["seed"] for row in rows))
@@ -170,6 +214,8 @@ def table(rows):
 def effect(name, results):
     """What a departure does: tracking error in open / closed loop, falls in closed loop and the distance to the goal in Maze 1
     without it, the mean of its seeds; of `shipped`, or if there is one seed, by seed. results: reads a file of results/."""
+    if name in PLANNERS:
+        return planner_effect(name, results("planner"))
     if name in LABEL_MODELS:
         return label_effect(LABEL_MODELS[name], results("wetvae"))
     rows, cells = [row for row in results("ablations") if row["without"] == name], []
@@ -212,7 +258,9 @@ def label_effect(labels, rows):
 if __name__ == "__main__":
     if sys.argv[1:] == ["closed"]:
         closed_loops(importlib.import_module("03_train_policy"), ROOT / "pretrained", (0, 1, 2))
+    elif sys.argv[1:] == ["planner"]:
+        planners(ROOT / "pretrained")
     elif len(sys.argv) == 2 and Path(sys.argv[1]).is_dir():
         main(Path(sys.argv[1]))
     else:
-        common.stop("usage: python tests/ablations.py FOLDER, or: closed")
+        common.stop("usage: python tests/ablations.py FOLDER, or: closed, or: planner")

@@ -548,6 +548,10 @@ def closed_loops():
     return ablations.closed_table(results("closed_loop")) or markdown([], [], "The closed loop's parts are", "python tests/ablations.py closed")
 
 
+def planners():
+    return ablations.planner_table(results("planner")) or markdown([], [], "The planner's departures are", "python tests/ablations.py planner")
+
+
 def pictures():
     lines = [f"![{path.stem}](../figures/{path.name})" for path in sorted((ROOT / "figures").glob("*.png"))]
     return "\n\n".join(lines).splitlines() or markdown([], [], "Figures are", "python 02_train_wetvae.py")
@@ -579,6 +583,8 @@ SECTIONS = [
      "batch relabelled, discount 0.995.", dads_tries),
     ("Parts of the closed loop: closed_loop.csv", "The shipped policies, executed with other laws of the closed loop (common.py, "
      "`closed_loop`), without training anew.", closed_loops),
+    ("Departures of the planner: planner.csv", "Mean distance to the goal and success of the shipped policies, dense reward, closed "
+     "loop, N = 10,000, 50 trials each, with one departure set back.", planners),
     ("Mazes (04): mazes.csv", "Intervals of all planning tables: 95 %, Student's t over the policies' means; with one "
      "policy over its trials, which says nothing about the next policy.", lambda: full_planning("mazes")),
     ("Mazes, each policy", "", lambda: full_planning("mazes", ("policy_seed",))),

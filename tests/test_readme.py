@@ -382,6 +382,27 @@ def test_claims_and_table_2_are_written_and_read(s4, repo, tmp_path, monkeypatch
 
 # ---------------------------------------------------------------- ablations
 
+def test_departures_of_the_planner(tmp_path, monkeypatch, s4):
+    """As shipped is what 04 does; each edit finds its text once, and changes what is planned."""
+    source = (ROOT / "04_mpc_maze.py").read_text(encoding="utf-8")
+    assert all(source.count(old) == 1 for _, edits in ablations.PLANNERS.values() for old, _ in edits)
+    monkeypatch.setattr(ablations, "ROOT", tmp_path)
+    monkeypatch.setitem(ablations.PLANNERS, "pool", ("--pool 64", []))  # quicker
+    (tmp_path / "04_mpc_maze.py").write_text(source, encoding="utf-8")
+    flags = "--policy_seeds 0 --mazes maze1 --rewards dense --modes closed --draw fig06 --samples 10 --trials 3 --threads 1"
+    ablations.planners(ROOT / "pretrained", flags + " --episode 150 --hold 10")
+    found = {row["planner"]: float(row["distance_m"]) for row in common.read_csv(tmp_path / "results/planner.csv")}
+    c, policy, _ = s4.check(*common.parse_flags(vars(s4), ["--out", str(tmp_path), *flags.split(), "--episode", "150", "--hold", "10"]))[0]
+    poses, _ = s4.plan_and_execute(c, policy)
+    assert found["as_shipped"] == pytest.approx(np.linalg.norm(poses[-1, :, :2] - c.goal, axis=1).mean(), rel=1e-4)
+    assert len(set(found.values())) == len(ablations.PLANNERS)
+    rows = common.read_csv(tmp_path / "results/planner.csv")
+    assert ablations.planner_table(rows)[2].startswith("| as_shipped | - | ") and len(ablations.planner_table(rows)) == 7
+    assert ablations.planner_effect("radius", rows) == ablations.NOT_YET  # Maze 2 is not there
+    rows += [row | dict(maze="maze2", distance_m="7.04") for row in rows]
+    assert ablations.effect("radius", lambda name: rows) == f"{found['radius']:.1f} and 7.0 m"
+
+
 def ablation(name, seed, **numbers):
     return {"without": name, "seed": seed} | dict.fromkeys(ablations.MEASURES, 0.5) | numbers
 
