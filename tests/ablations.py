@@ -40,6 +40,7 @@ SET_BACK = {  # name -> flags of 03
     "shipped": "", "base_frame": "--base_frame false", "relabelled": "--relabelled 0", "no_floor": "--floor_start 0 --floor_end 0",
     "schedules": "--averaged 0 --decay_from 1", "reward_scale": "--reward_scale 1 --temperature 0.01", "skill_steps": "--skill_steps 200",
     "actor_every": "--actor_every 1", "rate": "--learning_rate 3e-4 --decay_from 1", "hidden": "--hidden 512", "robots": "--robots 64",
+    "floor_end": "--floor_end 0.04",
     "variance": "", "together": "",
     "paper": "--base_frame false --relabelled 0 --floor_start 0 --floor_end 0 --averaged 0 --decay_from 1 --reward_scale 1 "
     "--temperature 0.01 --skill_steps 200 --actor_every 1 --learning_rate 3e-4 --hidden 512 --updates 17500"}  # in the same minutes
