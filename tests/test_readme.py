@@ -445,11 +445,13 @@ def test_each_ablation_says_with_which_flags_and_edits_it_is_trained(s3, tmp_pat
 def test_the_effect_of_a_full_training_is_compared_with_the_same_seeds(repo):
     assert ablations.full_effect("rate", report.results) == ablations.NOT_YET
     row = dict(tracking_error=0.2, tracking_error_closed=0.1, fall_rate=0.02)
-    repo.write("full_trainings", [dict(without="rate", loop="as shipped", seed=1) | row, dict(without="rate", loop="an earlier one", seed=2) | row])
+    repo.write("full_trainings", [dict(without="rate", loop="as shipped", seed=1) | row, dict(without="rate", loop="an earlier one", seed=2) | row]
+               + [dict(without="floor", loop="as shipped", seed=seed) | row | dict(fall_rate=falls) for seed, falls in ((0, 0), (1, 0.06))])
     assert ablations.full_effect("rate", report.results) == ablations.NOT_YET  # nothing to compare it with
     policies = [dict(experiment="ant_semi", seed=seed) | row | dict(tracking_error=error) for seed, error in ((0, 0.6), (1, 0.05))]
     repo.write("policies", [*policies, dict(experiment="ant_world_frame", seed=0) | row | dict(tracking_error=0.3)])
     assert ablations.full_effect("rate", report.results) == "0.20 / 0.10, 2.0 % instead of 0.05 / 0.10, 2.0 %"
+    assert ablations.full_effect("floor", report.results).startswith("0.20 / 0.10, 3.0 % instead of ")  # the mean of its seeds
     assert ablations.full_effect("base_frame", report.results) == "0.30 / 0.10, 2.0 % instead of 0.60 / 0.10, 2.0 %"
     assert report.made("<!-- full rate -->old<!-- / -->") == "<!-- full rate -->0.20 / 0.10, 2.0 % instead of 0.05 / 0.10, 2.0 %<!-- / -->"
 
