@@ -78,7 +78,7 @@ def weak_labels(factors, names, ranges):
 
 class Decoder(nn.Module):
     """p_theta(tau | z), Fig 1: an LSTM over z and its own last mean -> a Gaussian over the next displacement.
-    If it read the true last displacement, as in Eq. 3, two steps could tell it the factors without z."""
+    No teacher forcing: the true past, as in Eq. 3, could show the factors after two steps, without z."""
 
     def __init__(self, z_dim, x_dim, hidden):
         super().__init__()
